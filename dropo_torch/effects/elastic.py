@@ -18,6 +18,21 @@ LEAST_ROTOR = 0.01
 FREQUENCIES, ROTOR, DAMPED = (0.05, 0.15, 0.4), 0.2, 0.1
 
 
+#: Steps of the rotor between two rows of the log.
+STEPS = 2
+
+
+def _between(position: np.ndarray, velocity: np.ndarray, step: float, share: float) -> np.ndarray:
+    """Positions ``(R, P)`` at a share of the way from each row to the next, by a cubic (Hermite)."""
+    a, (q, after), (v, later) = share, (position[:, :-1], position[:, 1:]), (velocity[:, :-1], velocity[:, 1:])
+    return q + (after - q) * a**2 * (3 - 2 * a) + step * a * (1 - a) * ((1 - a) * v - a * later)
+
+
+def _by_row(values: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Values of the shape ``(R, P)``, row by row ``(P, R)``."""
+    return np.ascontiguousarray(np.broadcast_to(values, like.shape).T)
+
+
 class JointElasticity(JointEffect):
     """A gear, belt or cable that gives: the actuators drive a rotor, which pulls the joint through a spring.
 
@@ -90,25 +105,31 @@ class JointElasticity(JointEffect):
         drive: Drive,
     ) -> np.ndarray:  # fmt: skip
         """Return :meth:`recall` of a rotor that turned under the commands while the joint moved as the log shows."""
-        dof, half = setting.dof(target), 0.5 * drive.step
+        dof, step = setting.dof(target), drive.step / STEPS
         q, v = position[..., setting.coordinate(target)], velocity[..., dof]
         seen = np.isfinite(q[:, :-1])
         q, v = np.where(np.isfinite(q), q, 0.0), np.where(np.isfinite(v), v, 0.0)
         stiffness, damping, inertia = (x[:, None] for x in self._numbers(setting, target, values))
         given, stiff, damp = drive.given(dof, q[:, :-1], v[:, :-1])
         held = q[:, :-1] + given / (stiffness + stiff)
-        middle_q, middle_v = (0.5 * (x[:, :-1] + x[:, 1:]) for x in (q, v))
-        constant = given + stiff * q[:, :-1] + damp * v[:, :-1] + stiffness * middle_q + damping * middle_v
+        constant = given + stiff * q[:, :-1] + damp * v[:, :-1]
+        half = 0.5 * step
         whole = inertia + half * (damp + damping) + half**2 * (stiff + stiffness)
-        terms = inertia / whole, half * (stiff + stiffness) / whole, half * constant / whole
-        keeps, pulls, drives = (np.ascontiguousarray(np.broadcast_to(x, q[:, :-1].shape).T) for x in terms)
+        keeps, pulls = (_by_row(x, q[:, :-1]) for x in (inertia / whole, half * (stiff + stiffness) / whole))
+        drives = []
+        for share in (np.arange(STEPS) + 0.5) / STEPS:
+            there = stiffness * _between(q, v, drive.step, share) + damping * (
+                (1 - share) * v[:, :-1] + share * v[:, 1:]
+            )
+            drives.append(_by_row(half * (constant + there) / whole, q[:, :-1]))
         angle, speed, known = q[:, 0].copy(), v[:, 0].copy(), np.zeros(len(q), dtype=bool)
         for row in range(seen.shape[1]):  # the implicit midpoint rule, as in a simulation
             begins = seen[:, row] & ~known
             if begins.any():
                 angle[begins], speed[begins], known = held[begins, row], v[begins, row], known | begins
-            mean = keeps[row] * speed - pulls[row] * angle + drives[row]
-            angle, speed = angle + drive.step * mean, 2 * mean - speed
+            for driven in drives:
+                mean = keeps[row] * speed - pulls[row] * angle + driven[row]
+                angle, speed = angle + step * mean, 2 * mean - speed
         recalled = self.recall(setting, target, values, position[:, -1], velocity[:, -1])
         return np.where(known[:, None], np.stack([angle, speed, np.ones_like(angle)], 1), recalled)
 

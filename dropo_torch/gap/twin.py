@@ -29,7 +29,7 @@ from dropo_torch.simulators.hidden import filters_known
 #: Bytes of filtered commands that are kept; of the last candidate, in any case.
 KEPT = 2**27
 #: Seconds, and rows at most, before a window from which what a force remembers is replayed.
-PAST, MOST_PAST = 0.3, 150
+PAST, MOST_PAST = 1.0, 400
 #: Sets of initial states that are kept where loops have to be closed.
 CLOSED = 16
 
@@ -223,7 +223,9 @@ class Twin:
         return out, valid
 
     def settled(self, variant: Variant, commands: np.ndarray) -> np.ndarray:
-        """Return the logged step of each episode from which on a variant's commands are known as they act, ``(E,)``.
+        """Return the logged step of each episode from which on the log tells all that acts in a variant, ``(E,)``.
+
+        Those are its commands as they act, and what it remembers of the motion before.
 
         Args:
             variant: the hypothesis.
@@ -232,10 +234,12 @@ class Twin:
         filters = placed_filters(self.effects(variant), "command", self.setting)
         skip, lengths = self.setting.frame_skip, np.full(len(commands), commands.shape[1])
         found = settled_after(commands, filters, skip, float(self.setting.model.opt.timestep))
-        return np.maximum(found, filters_known(self._engine.lead, skip, lengths))
+        known = np.maximum(found, filters_known(self._engine.lead, skip, lengths))
+        remembers = any(p.effect.has("replay") for p in variant.placed)
+        return np.maximum(known, min(self._rows_before, commands.shape[1] // 4)) if remembers else known
 
     def knows(self, variant: Variant, windows: Windows) -> np.ndarray:
-        """Return whether all commands that act in a window under a variant follow from the log, ``(W,)`` bool."""
+        """Return whether all that acts in a window under a variant follows from the log, ``(W,)`` bool."""
         return windows.steps >= self.settled(variant, windows.commands)[windows.episodes]
 
     def _shown(self, variant: Variant, path: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
@@ -294,14 +298,18 @@ class Twin:
         there = SensedPath.of(past, 1, self.setting.frame_skip, step, tuple(self.rates))
         return true + shown - sensed(there, sensors)[:, 0]
 
+    @property
+    def _rows_before(self) -> int:
+        """Rows before a window from which what a force remembers is replayed."""
+        return min(math.ceil(PAST / self.setting.signals.timestep - 1e-9), MOST_PAST)
+
     def _past(self, variants: Sequence[Variant], windows: Windows) -> Past | None:
         """Return what was before windows, where an effect remembers it and the log shows it."""
         if windows.observed is None or not any(v.has("replay") for v in variants):
             return None
         if self.setting.observation.loops is not None:
             return None
-        rows, skip = math.ceil(PAST / self.setting.signals.timestep), self.setting.frame_skip
-        rows = min(rows, MOST_PAST, int(windows.steps.max(initial=0)))
+        rows, skip = min(self._rows_before, int(windows.steps.max(initial=0))), self.setting.frame_skip
         at = windows.steps[:, None] + np.arange(-rows, 1)
         columns = windows.observed[windows.episodes[:, None], np.maximum(at, 0)]
         states = self.setting.observation.full(columns.reshape(-1, columns.shape[-1])).reshape(*at.shape, -1)
