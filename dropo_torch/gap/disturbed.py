@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from dropo_torch.effects.actuator import driven_joint
 from dropo_torch.effects.base import Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.locate import dof_names, force_unit, middles
+from dropo_torch.gap.locate import dof_names, force_unit, instants, middles
 from dropo_torch.gap.log import cut_windows, episode_bounds, spread
 from dropo_torch.gap.noise import LENGTH, FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis
@@ -31,8 +31,9 @@ from dropo_torch.support.rows import evenly
 SECONDS, LONGEST, FEW, ALL = 0.08, 30, 24, 600
 #: Seconds that a push lasts at least, and windows without one between two that belong together.
 LEAST, APART = 0.05, 2
-#: Quantiles of a joint's motion elsewhere within which it was in a span.
-USUAL = (0.01, 0.99)
+#: Quantiles of a joint's motion elsewhere within which it was in a span; share of its largest force at which one has
+#: come; and of the surest joint's standard errors those of another that was pushed.
+USUAL, COMES, MAIN = (0.01, 0.99), 0.5, 0.2
 #: Share of the forces' mean squares that one on a body explains, at least, for the body to be named; and by how much
 #: more another may leave that explains it alike.
 EXPLAINED, ALIKE = 0.8, 1.05
@@ -102,17 +103,20 @@ def find_spans(scene: Scene, hypothesis: Hypothesis, noise: np.ndarray) -> tuple
         more = _between(far, rows)
         chance[more], reduced[more] = odds(evidence, windows.select(more), hypothesis.variant)
         far = chance < least
-    runs = _runs(np.flatnonzero(far), windows)
-    lost = np.array([reduced[a:b].sum() for a, b in runs])
-    main = [run for run, own in zip(runs, lost, strict=True) if own > rules.minor * lost.max()]
-    if len(main) > rules.spans or sum(b - a for a, b in main) > rules.share * len(windows):
+    main = far & (reduced > rules.minor * reduced.max())
+    runs, calm = _runs(np.flatnonzero(main), windows), np.setdiff1d(rows, _beside(np.flatnonzero(far)))
+    if len(runs) > rules.spans or main.sum() > rules.share * len(windows) or not calm.size:
         return ()
-    calm = windows.select(np.setdiff1d(rows, np.concatenate([np.arange(a - 1, b + 1) for a, b in runs])))
-    if not len(calm):
-        return ()
-    spans = {run: _span(scene, evidence, hypothesis, windows, run, calm) for run in main}
-    told = sum(own for run, own in zip(runs, lost, strict=True) if spans.get(run) is not None)
-    return tuple(s for s in spans.values() if s is not None) if told > scene.rules.most * lost.sum() else ()
+    there = windows.select(calm)
+    spans = {run: _span(scene, evidence, hypothesis, windows, run, reduced, there) for run in runs}
+    told = sum(float(reduced[a:b].sum()) for (a, b), span in spans.items() if span is not None)
+    most = told > scene.rules.most * float(reduced[far].sum())
+    return tuple(span for span in spans.values() if span is not None) if most else ()
+
+
+def _beside(rows: np.ndarray) -> np.ndarray:
+    """Some windows, and those before and after them."""
+    return np.unique(rows[:, None] + np.arange(-1, 2))
 
 
 def _all_windows(scene: Scene, hypothesis: Hypothesis) -> Windows:
@@ -150,8 +154,9 @@ def _runs(far: np.ndarray, windows: Windows) -> list[tuple[int, int]]:
 
 
 def _span(
-    scene: Scene, evidence: Evidence, hypothesis: Hypothesis, windows: Windows, run: tuple[int, int], calm: Windows
-) -> Span | None:
+    scene: Scene, evidence: Evidence, hypothesis: Hypothesis, windows: Windows, run: tuple[int, int],
+    reduced: np.ndarray, calm: Windows,
+) -> Span | None:  # fmt: skip
     """What a run of windows shows, if it is a push."""
     setting, rules = scene.setting, scene.rules.disturbed
     own = windows.select(np.arange(*run))
@@ -159,31 +164,40 @@ def _span(
         return None
     free = free_forces(scene.twin, own, hypothesis.variant, evidence.noise)
     known = np.isfinite(free.forces).all(1)
-    if not known.any() or np.median(free.left[known]) > rules.left:
+    most = np.maximum(rules.left, rules.rest * reduced[run[0] : run[1]])
+    if not known.any() or np.median((free.left / most)[known]) > 1:
         return None
-    sure = np.sqrt(np.nanmean((free.forces / free.errors) ** 2, axis=0))
-    pushed = np.flatnonzero(sure > rules.sure)
-    if not pushed.size or not all(_is_usual(setting, own, calm, int(dof), rules.near) for dof in pushed):
+    sure = np.abs(free.forces / free.errors)
+    mean = np.sqrt(np.nanmean(sure**2, axis=0))
+    pushed = np.flatnonzero((mean > rules.sure) & (mean > MAIN * mean.max()))
+    if not pushed.size or not all(_was_usual(setting, own, sure, calm, int(dof), rules.near) for dof in pushed):
         return None
-    return _told(scene, own, free, int(sure.argmax()))
+    return _told(scene, own, free, int(mean.argmax()))
 
 
-def _is_usual(setting: Setting, own: Windows, calm: Windows, dof: int, near: float) -> bool:
-    """Whether a joint was where, as fast and under the commands as at other times."""
+def _was_usual(setting: Setting, own: Windows, sure: np.ndarray, calm: Windows, dof: int, near: float) -> bool:
+    """Whether a joint was where, as fast and under the commands as at other times, mostly or before the force came.
+
+    A hard push takes a joint where it is at no other time, but it begins where the joint was by itself.
+    """
     model, joint = setting.model, int(setting.model.dof_jntid[dof])
     driven = [i for i in range(model.nu) if i < model.nactuator and driven_joint(model, i) == joint]
 
-    def signals(windows: Windows) -> np.ndarray:
-        position, velocity, commands = middles(setting, windows)
+    def signals(windows: Windows, row: int) -> np.ndarray:
+        position, velocity, commands = instants(setting, windows, row)
         ctrl = [commands[:, model.actuator_ctrladr[i]] for i in driven]
         return np.stack([position[:, model.jnt_qposadr[joint]], velocity[:, dof], *ctrl], 1)
 
-    there, here = signals(calm), signals(own)
+    there = signals(calm, calm.length // 2)
     low, high = np.quantile(there, USUAL, axis=0)
     size = np.maximum(there.std(0), 1e-12)
-    inside = ((here >= low) & (here <= high)).all(1)
-    distance, _ = cKDTree(there / size).query(here / size)
-    return bool(np.mean(inside & (distance < near)) > 0.5)
+
+    def usual(here: np.ndarray) -> np.ndarray:
+        distance, _ = cKDTree(there / size).query(here / size)
+        return np.asarray(((here >= low) & (here <= high)).all(1) & (distance < near))
+
+    came = np.flatnonzero(sure[:, dof] > COMES * np.nanmax(sure[:, dof]))[0]
+    return bool(usual(signals(own, own.length // 2)).mean() > 0.5 or usual(signals(own, 0))[came])
 
 
 def _told(scene: Scene, own: Windows, free: FreeForces, dof: int) -> Span:

@@ -64,9 +64,13 @@ def force_unit(model: mujoco.MjModel, dof: int) -> str:
 
 def middles(setting: Setting, windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions ``(W, nq)``, velocities ``(W, nv)`` and commands ``(W, nu)`` in the middle of windows."""
-    middle = windows.length // 2
-    states = setting.observation.full(windows.measured[:, middle], windows.unseen)
-    commands = windows.commands[windows.episodes, windows.steps + middle]
+    return instants(setting, windows, windows.length // 2)
+
+
+def instants(setting: Setting, windows: Windows, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions ``(W, nq)``, velocities ``(W, nv)`` and commands ``(W, nu)`` at a row of windows."""
+    states = setting.observation.full(windows.measured[:, row], windows.unseen)
+    commands = windows.commands[windows.episodes, windows.steps + row]
     return states[:, : setting.model.nq], states[:, setting.model.nq :], commands
 
 

@@ -294,9 +294,11 @@ class Disturbed:
         typical: χ² per degree of freedom of a typical stretch, at most; as if that were noise, others stand out.
         share: share of the log that spans take, at most.
         spans: spans, at most.
-        minor: share of what the worst span leaves up to which another one is none, for the model errs there otherwise.
+        minor: share of what the worst stretch leaves up to which another one is none, for the model errs there
+            otherwise.
         sure: standard errors of a joint's free force, by which it is one; and
-        left: χ² per degree of freedom that free forces may leave.
+        left: χ² per degree of freedom that free forces may leave; or the
+        rest: share of what the model leaves there.
         near: distance of a joint's position, velocity and commands from those of another time, in their standard
             deviations, within which it moved alike there.
     """
@@ -307,6 +309,7 @@ class Disturbed:
     minor: float = 0.02
     sure: float = 5.0
     left: float = 2.0
+    rest: float = 0.01
     near: float = 0.5
 
 
