@@ -721,6 +721,38 @@ def test_a_proposed_config_is_checked_and_fitted_as_it_is(
     assert main(["init", *files, "--out", str(path)]) == 2  # nothing of the user's is replaced
 
 
+def test_several_files_are_episodes(tmp_path: Path) -> None:
+    """Given one by one, or as a pattern; they have the same columns, and rows may be missing between them only."""
+    model, rng = mujoco.MjModel.from_xml_string(SERVOS), np.random.default_rng(6)
+    names, logs = ("t", "lift_pos", "bend_pos", "lift_target", "bend_target"), []
+    for number in range(3):
+        data, rows = mujoco.MjData(model), []
+        for row in range(400):
+            target = 0.3 * np.sin(0.05 * row * np.array((1, 1.7)) + number)
+            rows.append((0.02 * row, *data.qpos, *target))
+            data.ctrl[:] = target
+            mujoco.mj_step(model, data, 10)
+        log = np.array(rows)
+        log[:, 1:3] += 2e-4 * rng.standard_normal((400, 2))
+        logs.append(log)
+    files = [tmp_path / f"run_{number}.csv" for number in range(3)]
+    for file, log in zip(files, logs, strict=True):
+        np.savetxt(file, log, delimiter=",", header=",".join(names), comments="")
+    (tmp_path / "robot.xml").write_text(SERVOS)
+    robot, out = str(tmp_path / "robot.xml"), tmp_path / "robot.yaml"
+    assert main(["init", robot, *map(str, files), "--out", str(out)]) == 0
+    document = yaml.safe_load(out.read_text())
+    assert document["data"]["path"] == [f.name for f in files]
+    assert dropo.make_problem(dropo.load_config(out)).trajectories.num_episodes == 3
+    assert dropo.propose_config(robot, tmp_path / "run_*.csv", out=out).document["data"] == document["data"]
+    np.savetxt(files[1], np.delete(logs[1], range(100, 150), 0), delimiter=",", header=",".join(names), comments="")
+    with pytest.raises(dropo.InputError, match=r"run_0\.csv and 2 more: rows are missing within one of these files"):
+        dropo.propose_config(robot, files, out=out)
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n3,4\n")
+    with pytest.raises(dropo.InputError, match="nothing in all of them has a number"):
+        dropo.propose_config(robot, [files[0], tmp_path / "other.csv"], out=out)
+
+
 HELD_DOWN = """<mujoco><option timestep="0.005"/><worldbody><body pos="0 0 1">
   <joint name="lift" axis="0 1 0" damping=".2"/>
   <geom type="capsule" size=".03" fromto="0 0 0 .4 0 0" mass="1"/></body></worldbody>

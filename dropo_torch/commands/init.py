@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo init``."""
     parser.add_argument("model", type=Path, metavar="MODEL", help="MJCF or URDF")
-    parser.add_argument("data", type=Path, metavar="LOG", help="a log of any format: docs/data.md")
+    parser.add_argument(
+        "data", type=Path, nargs="+", metavar="LOG",
+        help="a log of any format: docs/data.md; several files, or a pattern, each with an episode or more",
+    )  # fmt: skip
     parser.add_argument(
         "--out", dest="path", type=Path, default=Path("robot.yaml"), metavar="CONFIG",
         help="the config to write (robot.yaml); the page lies beside it",

@@ -181,14 +181,18 @@ def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories
     if isinstance(source, str) and source.startswith(PREFIX):
         return [_read_minari(source.removeprefix(PREFIX), options)]
     if isinstance(source, str | Path):
-        return [log for path in _paths(source, base) for log in _read_path(path, options)]
+        return [log for path in matching_paths(source, base) for log in _read_path(path, options)]
     if isinstance(source, Sequence) and source:
         return [log for entry in source for log in _read(entry, options, base)]
     raise InputError(f"data: {source!r} given; expected a path, a list of paths, or a mapping with 'path'")
 
 
-def _paths(source: str | Path, base: Path) -> list[Path]:
-    """The path meant, or those that a pattern matches."""
+def matching_paths(source: str | Path, base: Path) -> list[Path]:
+    """Return the path meant, or those that a pattern matches.
+
+    Raises:
+        InputError: a pattern that no file matches.
+    """
     path = user_path(base, source)
     if path.exists() or not glob.has_magic(str(source)):
         return [path]

@@ -14,6 +14,7 @@ import numpy as np
 
 from dropo_torch.data.bags import unstamped
 from dropo_torch.data.formats import open_tables
+from dropo_torch.data.readers import matching_paths
 from dropo_torch.data.streams import TIME
 from dropo_torch.data.tables import Choice, Table, missing, numbers
 from dropo_torch.errors import InputError
@@ -79,10 +80,10 @@ class Columns:
     """The columns of a log.
 
     Attributes:
-        path: the file or folder.
-        source: it, for messages.
-        columns: its columns, in the file's order.
-        parts: first row of each part that the file itself keeps apart, such as HDF5 groups.
+        paths: the files, or the folder.
+        source: they, for messages.
+        columns: their columns, in the first file's order.
+        parts: first row of each file, and of each part that one itself keeps apart, such as HDF5 groups.
         group: pattern of these, as a config has it.
         separator: of a text file, where it is no comma.
         stamps: of a bag, as a config has them.
@@ -90,7 +91,7 @@ class Columns:
             command, at whose stamps columns are then interpolated.
     """
 
-    path: Path
+    paths: tuple[Path, ...]
     source: str
     columns: tuple[Column, ...]
     parts: tuple[int, ...] = (0,)
@@ -126,23 +127,26 @@ def last_part(array: str) -> str:
     return re.split(r"[./]", array.lower())[-1]
 
 
-def read_columns(path: str | Path, known: Sequence[str] = ()) -> Columns:
+def read_columns(log: str | Path | Sequence[str | Path], known: Sequence[str] = ()) -> Columns:
     """Read all columns of a log.
 
     Args:
-        path: the log.
+        log: the log, or a pattern of its files; or several.
         known: names of the model's objects, which may have words that otherwise tell a column's kind.
 
     Raises:
-        InputError: a file that cannot be read, or in which nothing has a row a sample.
+        InputError: a file that cannot be read, in which nothing has a row a sample, or that has other columns.
     """
-    path = Path(path)
-    separator = _separator(path)
-    tables = open_tables(path, separator=separator)
-    if tables[0].choose is not None:
-        return _of_streams(path, known)
-    found = _read(path, tables, separator)
-    return replace(found, columns=tuple(_understood(found.columns, known)))
+    given = [log] if isinstance(log, str | Path) else list(log)
+    paths = tuple(path for entry in given for path in matching_paths(entry, Path(".")))
+    separator = _separator(paths[0])
+    tables = open_tables(paths[0], separator=separator)
+    if tables[0].choose is None:
+        found = _read(paths, tables, separator)
+        return replace(found, columns=tuple(_understood(found.columns, known)))
+    if len(paths) > 1:
+        raise InputError(f"{paths[0]}: of files with streams, such as bags, init takes one; it got {len(paths)}")
+    return _of_streams(paths[0], known)
 
 
 def _understood(columns: Sequence[Column], known: Sequence[str]) -> list[Column]:
@@ -161,17 +165,23 @@ def _understood(columns: Sequence[Column], known: Sequence[str]) -> list[Column]
     return [replace(c, words=read_name(name, known)) for c, name in zip(columns, names, strict=True)]
 
 
-def _read(path: Path, tables: list[Table], separator: str | None) -> Columns:
+def _read(paths: tuple[Path, ...], tables: list[Table], separator: str | None) -> Columns:
     group = _group(tables[0].names)
     if group is not None:
-        tables = open_tables(path, group=group)
+        tables = open_tables(paths[0], group=group)
+    for path in paths[1:]:
+        tables = [*tables, *open_tables(path, separator=separator, group=group)]
     parts = [_of_table(table) for table in tables]
+    source = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
     names = [c.entry for c in parts[0] if all(any(c.entry == d.entry for d in other) for other in parts[1:])]
     starts = np.cumsum([0, *(len(p[0].labels) if p else 0 for p in parts)])[:-1]
     joined = [_joined([next(c for c in p if c.entry == name) for p in parts]) for name in names]
     if not joined:
-        raise InputError(f"{path}: nothing in it has a number a sample; expected columns of positions and commands")
-    return Columns(path, str(path), tuple(joined), tuple(int(s) for s in starts), group, separator)
+        raise InputError(
+            f"{source}: nothing in {'it' if len(paths) == 1 else 'all of them'} has a number a sample; expected "
+            "columns of positions and commands"
+        )
+    return Columns(paths, source, tuple(joined), tuple(int(s) for s in starts), group, separator)
 
 
 def _of_streams(path: Path, known: Sequence[str]) -> Columns:
@@ -197,7 +207,7 @@ def _of_streams(path: Path, known: Sequence[str]) -> Columns:
     kept = [_interpolated(c, time, time[rows]) for c in columns if np.isfinite(c.values).sum() > 1]
     used = {name: whence for name, whence in stamps.items() if any(c.array.startswith(f"{name}.") for c in kept)}
     apart = float(np.median(np.diff(time[rows])))
-    return Columns(path, str(path), tuple(kept), stamps=used, apart=apart)
+    return Columns((path,), str(path), tuple(kept), stamps=used, apart=apart)
 
 
 def _interpolated(column: Column, time: np.ndarray, at: np.ndarray) -> Column:

@@ -16,6 +16,7 @@ from dropo_torch.config import make_config
 from dropo_torch.data.corrections import continuous
 from dropo_torch.data.examination import Finding
 from dropo_torch.data.ticks import find_ticks
+from dropo_torch.errors import InputError
 from dropo_torch.logged import LoggedData, read_log
 from dropo_torch.proposal.clock import GAP, Clock
 from dropo_torch.proposal.columns import Columns
@@ -72,7 +73,7 @@ class Reading:
     """What is known of a log and its model before a config reads it.
 
     Attributes:
-        model, data: paths as the config has them.
+        model, data: paths as the config has them; the log's may be several.
         columns, matching, clock: the log, what its columns are and when its rows were taken.
         places: of the model.
         timestep: the model's, seconds.
@@ -80,7 +81,7 @@ class Reading:
     """
 
     model: str
-    data: str
+    data: Sequence[str]
     columns: Columns
     matching: Matching
     places: Sequence[Place]
@@ -162,7 +163,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
 def _source(reading: Reading) -> dict[str, Any]:
     """The keys of ``data`` that find the log, its time and its episodes."""
     columns, clock = reading.columns, reading.clock
-    source: dict[str, Any] = {"path": reading.data}
+    source: dict[str, Any] = {"path": reading.data[0] if len(reading.data) == 1 else list(reading.data)}
     source |= {} if columns.group is None else {"group": columns.group}
     source |= {} if columns.separator is None else {"separator": columns.separator}
     source |= {"stamps": dict(columns.stamps)} if columns.stamps else {}
@@ -176,6 +177,10 @@ def _source(reading: Reading) -> dict[str, Any]:
         source["episode"] = clock.episode.entry
     elif clock.terminals:
         source["terminals"] = [c.entry for c in clock.terminals]
+    if clock.breaks and len(reading.data) > 1:
+        raise InputError(
+            f"{columns.source}: rows are missing within one of these files; cut it there, or join them into one file"
+        )
     if clock.breaks:
         source["breaks"] = list(clock.breaks)
     return source

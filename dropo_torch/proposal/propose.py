@@ -110,7 +110,7 @@ class Proposal:
 
 def propose_config(
     model: str | Path,
-    log: str | Path,
+    log: str | Path | Sequence[str | Path],
     *,
     out: str | Path = "robot.yaml",
     dt: float | None = None,
@@ -126,7 +126,8 @@ def propose_config(
 
     Args:
         model: an MJCF or URDF.
-        log: a log of any format that the package reads.
+        log: a log of any format that the package reads, or a pattern such as ``runs/*.csv``; or several, which have the
+            same columns and follow on each other as episodes.
         out: the config to be written, from whose folder paths are told.
         dt: seconds between rows, for a log that does not say.
         seed: of the config.
@@ -158,7 +159,7 @@ def propose_config(
     choice = _chosen(candidates, found, review)
     if not choice.chosen:
         raise InputError(
-            f"{log}: the log tells none of the model's {len(candidates)} physical parameters; log a motion"
+            f"{columns.source}: the log tells none of the model's {len(candidates)} physical parameters; log a motion"
         )
     document |= {"lag": found.lag, "as_given": True}
     document |= {"parameters": {t.candidate.name: t.candidate.spec for t in choice.chosen}}
@@ -228,7 +229,8 @@ def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review |
         places = tuple(p for p in places if p.label in keep)
         matching = replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
     base = robot.out.resolve().parent
-    return Reading(_relative(path, base), _relative(columns.path, base), columns, matching, places, clock, step, base)
+    data = [_relative(p, base) for p in columns.paths]
+    return Reading(_relative(path, base), data, columns, matching, places, clock, step, base)
 
 
 def _loops(matching: Matching, model: mujoco.MjModel) -> Loops | None:

@@ -21,7 +21,7 @@ def config_text(proposal: Proposal) -> str:
     """Return the config with a comment on each choice."""
     document, choice = proposal.document, proposal.choice
     lines = [
-        f"# Proposed by `dropo init` from {document['model']} and {document['data']['path']}.",
+        f"# Proposed by `dropo init` from {document['model']} and {_logs(document['data']['path'])}.",
         "# Paths are relative to this file. `dropo check`, `fit` and `gap` take it as it is.",
         "",
         _key("model", document["model"]),
@@ -52,6 +52,11 @@ def config_text(proposal: Proposal) -> str:
         lines += ["", "# Left out; each fits in above if its cause is known better or a log shows more:"]
         lines += [f"#   {line}" for t in left for line in (_left(t),)]
     return "\n".join(lines) + "\n"
+
+
+def _logs(path: str | list[str]) -> str:
+    """The logs in words."""
+    return path if isinstance(path, str) else f"{path[0]} and {len(path) - 1} more"
 
 
 def _noise(document: dict[str, Any]) -> list[str]:
