@@ -132,12 +132,15 @@ def _all_windows(scene: Scene, hypothesis: Hypothesis) -> Windows:
 def _joined(first: Windows, second: Windows) -> Windows:
     """The windows of two logs of the same columns, the episodes of the second after those of the first."""
     both = (first, second)
-    wide = max(w.commands.shape[1] for w in both)
-    commands = [np.pad(w.commands, ((0, 0), (0, wide - w.commands.shape[1]), (0, 0)), "edge") for w in both]
     names = [n for n in ("measured", "rates", "steps", "unseen", "gains") if getattr(first, n) is not None]
     arrays: dict[str, Any] = {n: np.concatenate([getattr(w, n) for w in both]) for n in names}
+    for name in ("commands", "observed"):  # of whole episodes, the last row repeated
+        own = [x for w in both if (x := getattr(w, name)) is not None]
+        wide = max((x.shape[1] for x in own), default=0)
+        padded = [np.pad(x, ((0, 0), (0, wide - x.shape[1]), (0, 0)), "edge") for x in own]
+        arrays[name] = np.concatenate(padded) if len(own) == len(both) else None
     episodes = np.concatenate([first.episodes, second.episodes + len(first.commands)])
-    return replace(first, **arrays, episodes=episodes, commands=np.concatenate(commands))
+    return replace(first, **arrays, episodes=episodes)
 
 
 def _between(far: np.ndarray, rows: np.ndarray) -> np.ndarray:
