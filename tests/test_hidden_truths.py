@@ -176,7 +176,23 @@ def test_forces_are_those_of_mujocos_fields(system: System, effect: Effect, chan
     assert error(system, model, case).max() < 0.1
 
 
-@pytest.mark.parametrize("effect", [e for e in cases.OPTIONS if e not in ("integration", "dropout")])
+def test_a_rotor_behind_a_spring_changes_much() -> None:
+    """It has no strength at which it does nothing, for its rotor stays."""
+    numbers = {"compliance": 1 / 400, "damping": 2.0, "inertia": 0.3}
+    case, rigid = (
+        short(CART_POLE, *hidden, noise=0.0, transitions=60)
+        for hidden in ((Effect("joint_elasticity", "rail", numbers),), ())
+    )
+    noise = np.array(short(CART_POLE, transitions=2).noise)
+    found, without = (c.trajectories.next_observations for c in (case, rigid))
+    assert (np.abs(found - without) / noise).max() > 5.0
+
+
+#: Not those that are switched, and not what has a rotor of its own.
+GRADUAL = [e for e in cases.OPTIONS if e not in ("integration", "dropout", "joint_elasticity")]
+
+
+@pytest.mark.parametrize("effect", GRADUAL)
 def test_an_effect_of_no_strength_changes_nothing_and_a_strong_one_much(effect: str) -> None:
     name, targets = next(iter(cases.OPTIONS[effect].items()))
     system, target = SYSTEMS[name], targets[-1]
