@@ -13,7 +13,7 @@ import torch
 
 from dropo_torch.data.features import Features
 from dropo_torch.data.observation import Observation
-from dropo_torch.data.trajectory import Replay, Transitions
+from dropo_torch.data.trajectory import MOST_BEFORE, Replay, StatesBefore, Transitions
 from dropo_torch.errors import InputError
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.support.threads import single_thread
@@ -96,8 +96,21 @@ class Evaluator:
 
     def blocks(self, vectors: int, count: int | None = None) -> Iterator[slice]:
         """Return slices of ``count`` transitions, all by default, that may be simulated at once under P vectors."""
-        count, step = len(self) if count is None else count, max(1, self.chunk_size // max(1, vectors))
+        count, size = len(self) if count is None else count, self.chunk_size
+        if (past := self.transitions.past) is not None:
+            size = min(size, max(1, MOST_BEFORE // (past.count * past.padded.shape[1])))
+        step = max(1, size // max(1, vectors))
         return (slice(a, min(a + step, count)) for a in range(0, count, step))
+
+    def begun(self, rows: Rows, states: torch.Tensor | None = None) -> torch.Tensor:
+        """Return what a simulator is given to begin some transitions with: the states, after those of their past.
+
+        Args:
+            rows: t of the transitions.
+            states: M states from which to begin each, ``(t, M, num_states)``, in place of the logged one.
+        """
+        given = self.states[rows][:, None] if states is None else states
+        return _after_past(self.transitions.past, rows, given).flatten(0, 1)
 
     def after(self, rows: Rows, values: torch.Tensor, states: torch.Tensor | None = None) -> torch.Tensor:
         """Simulate some transitions under parameter values ``(P, d)``, in units; NaN where one diverges.
@@ -111,12 +124,10 @@ class Evaluator:
             Features ``(t, P, m)``, or ``(t * M, P, m)``.
         """
         controls, measured = self.controls[rows], self.columns[rows]
-        if states is None:
-            states = self.states[rows]
-        else:
+        begun = self.begun(rows, states)
+        if states is not None:
             controls, measured = (x.repeat_interleave(states.shape[1], 0) for x in (controls, measured))
-            states = states.flatten(0, 1)
-        columns = self.simulator.simulate(states, controls, values)[..., self.observation.index]
+        columns = self.simulator.simulate(begun, controls, values)[..., self.observation.index]
         return self.features.values(columns, measured[:, None].expand_as(columns))
 
     def map(self, values: np.ndarray | torch.Tensor, visit: Visit, rows: np.ndarray | None = None) -> Sums:
@@ -178,7 +189,8 @@ class Evaluator:
         states, controls, measured = (torch.from_numpy(x) for x in (replay.states, replay.controls, replay.measured))
 
         def part(block: slice) -> torch.Tensor:
-            after = self.simulator.rollout(states[block], controls[block], vectors)[..., self.observation.index]
+            begun = _after_past(replay.past, block, states[block][:, None]).flatten(0, 1)
+            after = self.simulator.rollout(begun, controls[block], vectors)[..., self.observation.index]
             logged = measured[block]
             about = logged[:, :1].expand_as(logged) if replay.about_start else logged
             features = self.features.values(after, about[:, None].expand_as(after))
@@ -201,6 +213,14 @@ class Evaluator:
 
 def _tensor(values: np.ndarray | torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
+
+
+def _after_past(past: StatesBefore | None, rows: Rows, states: torch.Tensor) -> torch.Tensor:
+    """States ``(t, M, num_states)`` after those of the rows before, ``(t, M, P + 1, num_states)``; alone where none."""
+    if past is None:
+        return states
+    before = torch.from_numpy(past[rows.numpy() if isinstance(rows, torch.Tensor) else rows])
+    return torch.cat([before[:, None].expand(-1, states.shape[1], -1, -1), states[:, :, None]], 2)
 
 
 def _total(part: Callable[..., torch.Tensor], chunks: Iterator[Rows]) -> torch.Tensor:

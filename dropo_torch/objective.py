@@ -188,7 +188,7 @@ class Objective:
     def simulated(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Return the observed columns ``(T, P, n)`` that the simulator gives for values ``(P, d)``, in units."""
         run, vectors = self.evaluator, torch.as_tensor(np.asarray(values), dtype=torch.float64)
-        parts = (run.simulator.simulate(run.states[b], run.controls[b], vectors) for b in run.blocks(len(vectors)))
+        parts = (run.simulator.simulate(run.begun(b), run.controls[b], vectors) for b in run.blocks(len(vectors)))
         return torch.cat([after[..., self.observation.index] for after in parts])
 
     def values(self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor) -> torch.Tensor:

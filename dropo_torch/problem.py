@@ -130,7 +130,9 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
     observation = _observation(config, space.model, simulator.num_states, width)
     trajectories = with_unseen(trajectories, observation, simulator.timestep, _ahead(space.model, frame_skip))
     lag = 1 if sensed else config.lag
-    transitions = make_transitions(trajectories, observation, lag=lag, history=simulator.history, since=since)
+    transitions = make_transitions(
+        trajectories, observation, lag=lag, history=simulator.history, past=simulator.past, since=since
+    )
     likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling", "orientation")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)

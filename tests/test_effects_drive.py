@@ -65,7 +65,8 @@ def true_path(actuator: str, commands: np.ndarray, position: tuple[float, float]
 def simulated(model: mujoco.MjModel, effect: dict, commands: np.ndarray, state: tuple[float, ...]) -> np.ndarray:
     damping = {"d": {"field": "dof_damping", "name": "elbow", "bounds": [0.0, 1.0]}}
     simulator, _ = simulator_of(model, [effect], damping, skip=round(SKIP * 0.001 / model.opt.timestep))
-    start, controls = torch.tensor([state], dtype=torch.float64), torch.from_numpy(commands[None, :, None])
+    padded = np.concatenate([np.repeat(commands[:1], simulator.history), commands])
+    start, controls = torch.tensor([state], dtype=torch.float64), torch.from_numpy(padded[None, :, None])
     return simulator.rollout(start, controls, torch.tensor([[0.05]], dtype=torch.float64))[0, 0].numpy()
 
 

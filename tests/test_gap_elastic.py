@@ -25,7 +25,10 @@ def test_what_depends_on_the_drive_is_found(effect: str, numbers: dict[str, floa
     gap = search(simulate_truth(CART_POLE, [Effect(effect, "rail", numbers)], 3, **SIZE), KNOWN)
     assert [(e.effect, e.target) for e in gap.effects] == [(effect, "rail")]
     first = next(iter(numbers))
-    assert gap.effects[0].parameters[first].value == pytest.approx(numbers[first], rel=0.1)
+    strength = gap.effects[0].parameters[first]
+    low, high = strength.interval
+    assert low <= numbers[first] <= high
+    assert high - low < 0.5 * numbers[first]
 
 
 def test_a_rotor_goes_on_from_the_rows_before() -> None:

@@ -48,7 +48,7 @@ def make_search(problem: Problem) -> Optimizer | None:
     given: dict[str, Any] = {"settings": settings, "seed": config.seed}
     if config.method in _REPLAYED:
         cut: dict[str, Any] = {"history": objective.transitions.history, "about_start": _REPLAYED[config.method]}
-        cut["since"] = problem.since
+        cut |= {"past": objective.simulator.past, "since": problem.since}
         given["replay"] = make_replay(problem.trajectories, problem.observation, given["settings"].horizon, **cut)
     return _SEARCHES[config.method](objective, **given)
 

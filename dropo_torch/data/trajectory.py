@@ -221,6 +221,47 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
     )
 
 
+#: Numbers in the states before windows that are held at once.
+MOST_BEFORE = 2**24
+
+
+@dataclass(frozen=True, eq=False)
+class StatesBefore:
+    """The states of so many rows before windows of a log, which are copied only for windows that are asked for.
+
+    Attributes:
+        padded: states of the log, ``count`` rows of NaN before each episode, ``(·, nq + nv)``.
+        first: row of it at which a window's past begins, ``(T,)``.
+        count: rows P of it.
+    """
+
+    padded: np.ndarray
+    first: np.ndarray
+    count: int
+
+    def __getitem__(self, rows: np.ndarray | slice) -> np.ndarray:
+        """Return the states before some windows, ``(t, P, nq + nv)``, NaN where their episode has not begun."""
+        return np.asarray(self.padded[self.first[rows][:, None] + np.arange(self.count)])
+
+    def select(self, rows: np.ndarray | slice) -> StatesBefore:
+        """Return those of the given windows."""
+        return replace(self, first=self.first[rows])
+
+
+def states_before(
+    trajectories: Trajectories, observation: Observation, rows: np.ndarray, count: int
+) -> StatesBefore | None:
+    """Return the states of ``count`` rows before rows of a log, ``(T,)``; ``None`` of no rows."""
+    if not count:
+        return None
+    states = observation.states(trajectories.observations, trajectories.unseen)
+    begins = np.append(True, trajectories.terminals[:-1])
+    at = np.arange(len(trajectories)) + count * np.cumsum(begins)
+    padded = np.full((at[-1] + 1, states.shape[1]), np.nan)
+    padded[at] = states
+    return StatesBefore(padded, at[rows] - count, count)
+
+
 @dataclass(frozen=True, eq=False)
 class Transitions(ByValue):
     """λ-step windows of a log: from a state, through λ controls, to what was measured.
@@ -232,6 +273,7 @@ class Transitions(ByValue):
         rows: row of the log at which each window starts, ``(T,)``.
         episodes: episode of each window, ``(T,)``.
         history: logged steps before a window whose controls come with it, for actuators that remember.
+        past: the states before, for effects that remember them.
     """
 
     states: np.ndarray
@@ -240,6 +282,7 @@ class Transitions(ByValue):
     rows: np.ndarray
     episodes: np.ndarray
     history: int = 0
+    past: StatesBefore | None = None
 
     def __len__(self) -> int:
         """Return the number of windows T."""
@@ -253,7 +296,8 @@ class Transitions(ByValue):
     def select(self, rows: np.ndarray | slice) -> Transitions:
         """Return the given windows."""
         names = ("states", "controls", "measured", "rows", "episodes")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+        past = None if self.past is None else self.past.select(rows)
+        return replace(self, **{name: getattr(self, name)[rows] for name in names}, past=past)
 
 
 def make_transitions(
@@ -262,6 +306,7 @@ def make_transitions(
     *,
     lag: int = 1,
     history: int = 0,
+    past: int = 0,
     since: np.ndarray | None = None,
 ) -> Transitions:
     """Cut a log into consecutive windows of ``lag`` transitions that never cross an episode's end.
@@ -274,6 +319,7 @@ def make_transitions(
         observation: its columns.
         lag: transitions of a window.
         history: logged steps before a window whose controls come with it.
+        past: logged steps before a window whose states come with it.
         since: transition of each episode at which its first window starts, ``(E,)``; its first one by default.
 
     Raises:
@@ -313,6 +359,7 @@ def make_transitions(
         rows=rows,
         episodes=trajectories.episodes[rows],
         history=history,
+        past=states_before(trajectories, observation, rows, past),
     )
 
 
@@ -326,6 +373,7 @@ class Replay:
         measured: observed columns after each of the H steps, ``(W, H, n)``.
         history: logged steps before a window whose controls come with it.
         about_start: whether orientations are compared with the window's first measured one, instead of step by step.
+        past: the states before, for effects that remember them.
     """
 
     states: np.ndarray
@@ -333,6 +381,7 @@ class Replay:
     measured: np.ndarray
     history: int = 0
     about_start: bool = False
+    past: StatesBefore | None = None
 
     @property
     def horizon(self) -> int:
@@ -346,18 +395,20 @@ def make_replay(
     horizon: int,
     *,
     history: int = 0,
+    past: int = 0,
     about_start: bool = False,
     since: np.ndarray | None = None,
 ) -> Replay:
     """Cut a log into consecutive windows of about ``horizon`` transitions; see :func:`horizon_of`."""
     steps = horizon_of(trajectories, horizon, since)
-    windows = make_transitions(trajectories, observation, lag=steps, history=history, since=since)
+    windows = make_transitions(trajectories, observation, lag=steps, history=history, past=past, since=since)
     return Replay(
         states=windows.states,
         controls=windows.controls,
         measured=measured_path(trajectories, observation, windows),
         history=history,
         about_start=about_start,
+        past=windows.past,
     )
 
 

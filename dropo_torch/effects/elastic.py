@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from dropo_torch.effects.base import Quantity, Setting, object_number
-from dropo_torch.effects.drive import Drive, detach, driven_joints
-from dropo_torch.effects.joint import JointEffect, unit
+from dropo_torch.effects.drive import Drive, detach
+from dropo_torch.effects.joint import DrivenJointEffect, unit
 
 #: Highest frequency at which the joint may oscillate on the spring, in radians of a physics step.
 STIFFEST = 0.5
@@ -33,7 +33,7 @@ def _by_row(values: np.ndarray, like: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(values, like.shape).T)
 
 
-class JointElasticity(JointEffect):
+class JointElasticity(DrivenJointEffect):
     """A gear, belt or cable that gives: the actuators drive a rotor, which pulls the joint through a spring.
 
     The log shows the joint, behind the spring; servos see the rotor, where their encoders are. Of the joint's armature
@@ -45,11 +45,6 @@ class JointElasticity(JointEffect):
     name = "joint_elasticity"
     positional = True
     sentence = "the transmission of {target} gives: a spring between its motor and the joint"
-
-    def targets(self, setting: Setting) -> list[str | None]:
-        """Return every such joint that is driven, by actuators whose forces follow from command and state."""
-        driven = driven_joints(setting.model)
-        return [t for t in super().targets(setting) if setting.joint(t) in driven]
 
     @staticmethod
     def own_inertia(setting: Setting, target: str | None) -> float:
@@ -86,12 +81,6 @@ class JointElasticity(JointEffect):
         dof = model.jnt_dofadr[joint]
         model.dof_armature[dof] = max(model.dof_armature[dof] - values[2], 0.0)
         detach(model, joint)  # its actuators drive the rotor alone
-
-    def force(
-        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
-    ) -> np.ndarray:
-        """Return the forces where nothing drives the rotor: none."""
-        return np.zeros_like(velocity)
 
     def recall(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray

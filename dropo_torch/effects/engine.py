@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -21,6 +22,8 @@ from dropo_torch.simulators.hidden import filter_memory, filters_of, refuse_pres
 from dropo_torch.simulators.mujoco import default_row
 
 Models = Sequence[mujoco.MjModel | None]
+#: Seconds, and rows at most, before a simulation from which what an effect remembers is replayed.
+PAST, MOST_PAST = 1.0, 400
 #: Simulations below which handing work to threads costs more than it saves.
 ALONE = 200
 
@@ -92,6 +95,16 @@ class Past:
 
     states: np.ndarray
     commands: np.ndarray
+
+
+def past_rows(timestep: float) -> int:
+    """Return the rows before a simulation from which what an effect remembers is replayed, of ``timestep`` seconds."""
+    return min(math.ceil(PAST / timestep - 1e-9), MOST_PAST)
+
+
+def remembered_from(lengths: np.ndarray, timestep: float) -> np.ndarray:
+    """Return the row of episodes, of so many ``(E,)``, from which on the log shows the past that effects remember."""
+    return np.minimum(past_rows(timestep), lengths // 4)
 
 
 def drives_of(forces: Iterable[Force], models: Models, each: int = 1) -> Drives | None:

@@ -188,15 +188,6 @@ class JointStribeck(JointEffect):
         return out
 
 
-#: Physics steps in which friction that is a force, and no constraint, stops a joint that is slow.
-STOPS = 4.0
-
-
-def stopping(model: mujoco.MjModel, dof: int, velocity: np.ndarray) -> np.ndarray:
-    """Return the sizes ``(R,)`` of forces that stop a joint of velocities ``(R,)`` in a few physics steps."""
-    return np.asarray(model.dof_M0[dof] * np.abs(velocity) / (STOPS * model.opt.timestep))
-
-
 class JointFrictionSlope(JointEffect):
     """Dry friction that is larger at one end of a joint's range than at the other, as where a linkage drives it.
 
@@ -209,6 +200,8 @@ class JointFrictionSlope(JointEffect):
     positional = True
     alone = False
     sentence = "dry friction in {target} that changes along its range"
+    #: Physics steps in which this part, a force and no constraint, stops a joint that is slow.
+    STOPS = 4.0
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         low, high = setting.signals.position[setting.coordinate(target)]
@@ -228,12 +221,27 @@ class JointFrictionSlope(JointEffect):
     ) -> np.ndarray:
         m, dof, out = setting.model, setting.dof(target), np.zeros_like(velocity)
         level = values[:, 0] * (position[:, setting.coordinate(target)] - self.middle(m, target))
-        most = stopping(m, dof, velocity[:, dof])
+        most = m.dof_M0[dof] * np.abs(velocity[:, dof]) / (self.STOPS * m.opt.timestep)
         out[:, dof] = -np.sign(velocity[:, dof]) * np.sign(level) * np.minimum(np.abs(level), most)
         return out
 
 
-class JointLoadFriction(JointEffect):
+class DrivenJointEffect(JointEffect):
+    """An effect at a joint that acts through what its actuators give, and does nothing without."""
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return every such joint that is driven, by actuators whose forces follow from command and state."""
+        driven = driven_joints(setting.model)
+        return [t for t in super().targets(setting) if setting.joint(t) in driven]
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        """Return the forces without actuators: none."""
+        return np.zeros_like(velocity)
+
+
+class JointLoadFriction(DrivenJointEffect):
     """Dry friction that grows with the load, as of a gear whose teeth press harder on each other.
 
     On top of the dry friction that the joint has otherwise, a share of the size of what its actuators give acts against
@@ -246,19 +254,8 @@ class JointLoadFriction(JointEffect):
     #: Share of the joint's inertia in the model's first configuration that it surely has in others.
     SURE = 0.5
 
-    def targets(self, setting: Setting) -> list[str | None]:
-        """Return every such joint that is driven, by actuators whose forces follow from command and state."""
-        driven = driven_joints(setting.model)
-        return [t for t in super().targets(setting) if setting.joint(t) in driven]
-
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         return (Quantity("coefficient", "-", 0.0, 0.0, 0.9, 0.2),)
-
-    def force(
-        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
-    ) -> np.ndarray:
-        """Return the forces under no load: none."""
-        return np.zeros_like(velocity)
 
     def recall(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray

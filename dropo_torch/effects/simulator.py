@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.data.trajectory import Trajectories
+from dropo_torch.data.trajectory import MOST_BEFORE, Trajectories
 from dropo_torch.effects.base import Placed, applied
-from dropo_torch.effects.engine import Variant, VariantEngine, parts, whole_ratio
+from dropo_torch.effects.engine import Past, Variant, VariantEngine, parts, past_rows, remembered_from, whole_ratio
 from dropo_torch.effects.filters import (
     Filter,
     extended,
@@ -39,20 +39,22 @@ SHARES = (1.0, 0.5, 0.25, 0.0)
 #: Logged steps of history for a filter that remembers all of its past.
 LONGEST_HISTORY = 200
 
-
 #: Simulates true states under commands of every physics step: of parameter vectors ``(K, d)``, states at the start
-#: ``(K, T, n)``, commands as they act ``(K, T, S, nu)`` and whether the result is fine. Returns the states after every
-#: physics step ``(K, T, S, n)`` or, not fine, after every logged one ``(K, T, S / skip, n)``, NaN where diverged.
-Engine = Callable[[np.ndarray, np.ndarray, np.ndarray, bool], np.ndarray]
+#: ``(K, T, n)``, commands as they act ``(K, T, S, nu)``, whether the result is fine, and what was before, if known.
+#: Returns the states after every physics step ``(K, T, S, n)`` or, not fine, after every logged one
+#: ``(K, T, S / skip, n)``, NaN where diverged.
+Engine = Callable[[np.ndarray, np.ndarray, np.ndarray, bool, Past | None], np.ndarray]
 
 
 def inner_engine(effects: EffectSet, space: ParameterSpace, num_threads: int) -> Engine:
     """Return MuJoCo, with every kind of effect."""
     inner = VariantEngine(effects.setting, space, num_threads=num_threads)
 
-    def engine(values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
+    def engine(
+        values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool, past: Past | None
+    ) -> np.ndarray:
         variants = [Variant(tuple(v.tolist()), effects.at(v)) for v in values]
-        return inner.paths(variants, inner.models(variants), starts, signals, fine=fine)
+        return inner.paths(variants, inner.models(variants), starts, signals, fine=fine, past=past)
 
     return engine
 
@@ -61,7 +63,10 @@ def outer_engine(effects: EffectSet, inner: Simulator) -> Engine:
     """Return another simulator, which takes one physics step a control; effects stay outside of it."""
 
     @torch.no_grad()
-    def engine(values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
+    def engine(
+        values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool, past: Past | None
+    ) -> np.ndarray:
+        del past  # no force is outside, and so none that remembers
         first, kind = effects.kinds(values)  # parameter vectors whose effects are the same go together
         every = 1 if fine else effects.setting.frame_skip
         out = np.empty((len(values), starts.shape[1], (signals.shape[2] - inner.history) // every, starts.shape[2]))
@@ -75,7 +80,7 @@ def outer_engine(effects: EffectSet, inner: Simulator) -> Engine:
 
 
 class EffectSimulator(Simulator):
-    """A simulator with effects: ``controls`` carry ``history`` logged steps before the window.
+    """A simulator with effects: ``controls`` carry ``history`` logged steps before the window, ``states`` ``past``.
 
     States go in and come out as the sensors show them: the true start is found from the measured one, and a
     measurement that comes late is taken from the simulated path, or, from before its start, from the start's velocity.
@@ -85,6 +90,7 @@ class EffectSimulator(Simulator):
         effects: the effects, understood in a setting.
         parameters: what varies, numbers of effects among it.
         history: logged steps of controls before each window.
+        past: logged steps before a window whose states effects remember; at most as many as of controls.
         lead: physics steps before a window whose commands the engine gets, too, for filters in the model.
         timestep: seconds of a logged transition.
         name: the backend's name.
@@ -95,8 +101,8 @@ class EffectSimulator(Simulator):
     differentiable: ClassVar[bool] = False
 
     def __init__(
-        self, engine: Engine, effects: EffectSet, *, parameters: ParameterSpace, history: int, lead: int,
-        timestep: float, name: str, chunk_size: int,
+        self, engine: Engine, effects: EffectSet, *, parameters: ParameterSpace, history: int, past: int,
+        lead: int, timestep: float, name: str, chunk_size: int,
     ) -> None:  # fmt: skip
         setting = effects.setting
         self.name = name  # type: ignore[misc]  # the backend's own
@@ -104,7 +110,7 @@ class EffectSimulator(Simulator):
             f"effects such as {effects.entries[0].effect.name} are simulated without gradients; "
             "use optimizer: fisher or cma"
         )
-        self.parameters, self.history, self._lead = parameters, history, lead
+        self.parameters, self.history, self.past, self._lead = parameters, history, past, lead
         self.frame_skip, self.timestep = setting.frame_skip, timestep
         self.num_states = setting.model.nq + setting.model.nv
         self.num_controls = setting.model.nu
@@ -125,6 +131,12 @@ class EffectSimulator(Simulator):
 
     def check_arguments(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> None:
         """Raise an :class:`InputError` for arguments whose shapes do not fit."""
+        if self.past and states.ndim == 3:
+            if states.shape[1] != self.past + 1:
+                raise InputError(
+                    f"states: {states.shape[1]} rows given for each; these effects remember {self.past} before its own"
+                )
+            states = states[:, -1]
         super().check_arguments(states, controls, values)
         if controls.shape[1] <= self.history:
             raise InputError(
@@ -135,20 +147,27 @@ class EffectSimulator(Simulator):
     def _run(self, states: Numbers, controls: Numbers, values: Numbers, *, last: bool) -> torch.Tensor:
         start, control, vectors = self.arrays(states, controls, values)
         lag = control.shape[1] - self.history
-        out = np.empty((len(start), len(vectors), 1 if last else lag, self.num_states))
-        for k in parts(len(vectors), self._chunk_size):
-            for t in parts(len(start), max(1, self._chunk_size // len(vectors[k]))):
-                found = self._chunk(start[t], control[t], vectors[k])
+        start, before = (start[:, -1], start) if start.ndim == 3 else (start, None)
+        out, size = np.empty((len(start), len(vectors), 1 if last else lag, self.num_states)), self._chunk_size
+        if before is not None:
+            size = min(size, max(1, MOST_BEFORE // before[0].size))
+        for k in parts(len(vectors), size):
+            for t in parts(len(start), max(1, size // len(vectors[k]))):
+                found = self._chunk(start[t], None if before is None else before[t], control[t], vectors[k])
                 out[t, k] = (found[:, :, -1:] if last else found).swapaxes(0, 1)
         return torch.from_numpy(out)
 
-    def _chunk(self, start: np.ndarray, control: np.ndarray, values: np.ndarray) -> np.ndarray:
+    def _chunk(
+        self, start: np.ndarray, before: np.ndarray | None, control: np.ndarray, values: np.ndarray
+    ) -> np.ndarray:
         """Return states as the sensors show them, ``(K, T, lag, num_states)``."""
-        signals = self._signals(control, values)
-        begin = self.history * self.frame_skip - self._lead
-        starts = np.repeat(start[None], len(values), 0)
+        signals, skip = self._signals(control, values), self.frame_skip
+        begin = self.history * skip - self._lead
+        starts, past = np.repeat(start[None], len(values), 0), None
+        if before is not None:
+            past = Past(before, signals[:, :, (self.history - self.past) * skip : self.history * skip : skip])
         if not len(self._sensors):
-            return self._engine(values, starts, signals[:, :, begin:], False)
+            return self._engine(values, starts, signals[:, :, begin:], False, past)
         rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0) :][:, :, : self._lead + 1], values)
         index, known = self._setting.observation.index, self._rates >= 0
         shown = starts[..., index].copy()
@@ -159,9 +178,9 @@ class EffectSimulator(Simulator):
         if self._late:  # with the velocities now true, and changing, the past shows what is missing
             rates[..., known] = starts[..., self._rates[known]]
             starts[..., index] += shown - self._shown(starts[:, :, None], rates, sensors)[:, :, 0]
-        fine = self._engine(values, starts, signals[:, :, begin:], True)
+        fine = self._engine(values, starts, signals[:, :, begin:], True, past)
         fine = np.concatenate([starts[:, :, None], fine], 2)
-        out = fine[:, :, self.frame_skip :: self.frame_skip].copy()
+        out = fine[:, :, skip::skip].copy()
         out[..., index] = self._shown(fine, rates, sensors)[:, :, 1:]
         return out
 
@@ -180,7 +199,7 @@ class EffectSimulator(Simulator):
         """
         if not self._late:
             return np.zeros_like(starts)
-        after = self._engine(values, starts, command, True)[:, :, 0]
+        after = self._engine(values, starts, command, True, None)[:, :, 0]
         rates = np.nan_to_num((after - starts) * (self.frame_skip / (self.timestep or 1.0)))
         known = self._rates >= 0
         rates[..., known] = starts[..., self._rates[known]]
@@ -271,10 +290,10 @@ def history_steps(effects: EffectSet, space: ParameterSpace, timestep: float, lo
 
 
 def first_known(effects: EffectSet, space: ParameterSpace, log: Trajectories, timestep: float) -> np.ndarray:
-    """Return the transition of each episode from which on the commands that act are known from the log, ``(E,)``.
+    """Return the transition of each episode from which on the log tells all that acts, ``(E,)``.
 
-    They are under all values in the search box; where that would leave out more than half of the log, under those of
-    its lower half, quarter, ...
+    Those are the commands as they act, and what effects remember of the motion before. They are under all values in
+    the search box; where that would leave out more than half of the log, under those of its lower half, quarter, ...
 
     Args:
         effects: the effects.
@@ -289,7 +308,9 @@ def first_known(effects: EffectSet, space: ParameterSpace, log: Trajectories, ti
     def needed(share: float) -> np.ndarray:
         placed = effects.at(space.low + share * (space.high - space.low))
         filters = placed_filters(placed, "command", setting)
-        return np.maximum(settled_after(commands, filters, skip, timestep / skip), before)
+        known = np.maximum(settled_after(commands, filters, skip, timestep / skip), before)
+        remembers = len(effects.having("replay"))
+        return np.maximum(known, remembered_from(lengths, timestep)) if remembers else known
 
     found = np.zeros_like(lengths)
     for share in SHARES:
@@ -345,10 +366,11 @@ def effect_simulator(
             return make(model, setting.frame_skip * finer, space.on(model))
         inner = make(model, finer, space.on(model))
         engine, kept, lead = outer_engine(effects.outer, inner), effects.outer, inner.history
-    history = history_steps(kept, space, timestep, longest, lead)
+    past = past_rows(timestep) if len(kept.having("replay")) else 0
+    history = max(history_steps(kept, space, timestep, longest, lead), past)
     return EffectSimulator(
-        engine, kept, parameters=space, history=history, lead=lead, timestep=timestep, name=backend,
-        chunk_size=chunk_size,
+        engine, kept, parameters=space, history=history, past=past, lead=lead, timestep=timestep,
+        name=backend, chunk_size=chunk_size,
     )  # fmt: skip
 
 

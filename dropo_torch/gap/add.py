@@ -109,11 +109,6 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
         notes.append("config.yaml leaves out what it did, and not the pushes: add their spans to leave_out.")
     elif gap.disturbances:
         config = config.model_copy(update={"leave_out": pushed_spans(gap)})
-    if remembering := [p for p in found if p.effect.has("replay")]:
-        notes.append(
-            f"A fit and a training are not given the rows before a window, which {_place(remembering[0])} remembers: "
-            "take its numbers from here."
-        )
     options = {"whole": problem.sensed is not None}
     write_config(config, problem.space, setting, list(found), ranges, model, folder / "config.yaml", **options)
     return notes

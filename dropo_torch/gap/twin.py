@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 
 from dropo_torch.effects.base import Placed, Setting, applied, find_effect
-from dropo_torch.effects.engine import Past, Variant, VariantEngine, parts, whole_ratio
+from dropo_torch.effects.engine import Past, Variant, VariantEngine, parts, past_rows, remembered_from, whole_ratio
 from dropo_torch.effects.filters import (
     Filter,
     extended,
@@ -28,8 +27,6 @@ from dropo_torch.simulators.hidden import filters_known
 
 #: Bytes of filtered commands that are kept; of the last candidate, in any case.
 KEPT = 2**27
-#: Seconds, and rows at most, before a window from which what a force remembers is replayed.
-PAST, MOST_PAST = 1.0, 400
 #: Sets of initial states that are kept where loops have to be closed.
 CLOSED = 16
 
@@ -236,7 +233,7 @@ class Twin:
         found = settled_after(commands, filters, skip, float(self.setting.model.opt.timestep))
         known = np.maximum(found, filters_known(self._engine.lead, skip, lengths))
         remembers = any(p.effect.has("replay") for p in variant.placed)
-        return np.maximum(known, min(self._rows_before, commands.shape[1] // 4)) if remembers else known
+        return np.maximum(known, remembered_from(lengths, self.setting.signals.timestep)) if remembers else known
 
     def knows(self, variant: Variant, windows: Windows) -> np.ndarray:
         """Return whether all that acts in a window under a variant follows from the log, ``(W,)`` bool."""
@@ -298,18 +295,14 @@ class Twin:
         there = SensedPath.of(past, 1, self.setting.frame_skip, step, tuple(self.rates))
         return true + shown - sensed(there, sensors)[:, 0]
 
-    @property
-    def _rows_before(self) -> int:
-        """Rows before a window from which what a force remembers is replayed."""
-        return min(math.ceil(PAST / self.setting.signals.timestep - 1e-9), MOST_PAST)
-
     def _past(self, variants: Sequence[Variant], windows: Windows) -> Past | None:
         """Return what was before windows, where an effect remembers it and the log shows it."""
         if windows.observed is None or not any(v.has("replay") for v in variants):
             return None
         if self.setting.observation.loops is not None:
             return None
-        rows, skip = min(self._rows_before, int(windows.steps.max(initial=0))), self.setting.frame_skip
+        before, skip = past_rows(self.setting.signals.timestep), self.setting.frame_skip
+        rows = min(before, int(windows.steps.max(initial=0)))
         at = windows.steps[:, None] + np.arange(-rows, 1)
         columns = windows.observed[windows.episodes[:, None], np.maximum(at, 0)]
         states = self.setting.observation.full(columns.reshape(-1, columns.shape[-1])).reshape(*at.shape, -1)

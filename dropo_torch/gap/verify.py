@@ -189,16 +189,7 @@ def _one_step(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[n
     sums = objective.map(values[None], collect, initial=initial)
     twin.simulated_transitions += sums.simulated_transitions + (initial.simulated_transitions if initial else 0)
     error, covariance = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
-    if any(p.effect.has("replay") for p in twin.effects(hypothesis.variant)):
-        error = _after_the_past(evidence, held, hypothesis)
     return error, covariance
-
-
-def _after_the_past(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> np.ndarray:
-    """Errors of single steps ``(T, m)`` of what remembers the rows before, which a fit's simulator is not given."""
-    windows = cut_windows(held.log, evidence.twin.setting.observation, 1, stride=1).select(held.rows)
-    found, _ = evidence.twin.predict([hypothesis.variant], windows)
-    return np.asarray(evidence.chart.difference(windows.measured, found)[0, :, 1])
 
 
 def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Objective:
@@ -221,7 +212,8 @@ def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -
         )  # fmt: skip
     else:
         simulator = make(setting.model, setting.frame_skip, space)
-    transitions = make_transitions(held.log, setting.observation, history=simulator.history).select(held.rows)
+    cut = make_transitions(held.log, setting.observation, history=simulator.history, past=simulator.past)
+    transitions = cut.select(held.rows)
     noise = Features.of(setting.observation).column_noise(evidence.noise)
     if held.log.gains is not None:  # of rows between samples, on average
         gains = held.log.gains[held.rows][..., list(setting.observation.log_columns)]

@@ -127,7 +127,7 @@ class Ground:
         since = np.full(len(states), min(math.ceil(simulator.history), self.steps // 10))
         every = make_transitions(
             self.log_of(states, commands), self.problem.observation, lag=self.config.lag, history=simulator.history,
-            since=since,
+            past=simulator.past, since=since,
         )  # fmt: skip
         whole = len(every) // len(states)
         runs = max(1, min(WINDOWS, whole) // RUN)

@@ -174,8 +174,9 @@ def _microseconds(problem: Problem) -> float:
 def _at_lag(problem: Problem, candidates: Sequence[Candidate], lag: int, steps: int) -> Information:
     """Fisher information by windows of one length."""
     every = make_transitions(
-        problem.trajectories, problem.observation, lag=lag, history=problem.simulator.history, since=problem.since
-    )
+        problem.trajectories, problem.observation, lag=lag, history=problem.simulator.history,
+        past=problem.simulator.past, since=problem.since,
+    )  # fmt: skip
     wanted = max(8, steps // lag)
     rows = evenly(len(every), wanted)
     objective = problem.objective.on(every.select(rows))

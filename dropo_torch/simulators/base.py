@@ -31,6 +31,8 @@ class Simulator(abc.ABC):
         parameters: what varies, d parameters.
         frame_skip: physics steps of one logged transition.
         history: logged steps before each transition whose controls come with it, for what remembers them.
+        past: logged steps before each transition whose states may come with it, ``(T, past + 1, num_states)``, NaN
+            where nothing is known of them.
         num_states: width of a state, ``nq + nv`` for a MuJoCo model.
         num_controls: width of a control, ``nu``.
         notes: how it simulates otherwise than the model's options say, in sentences for a person.
@@ -43,6 +45,7 @@ class Simulator(abc.ABC):
     parameters: ParameterSpace
     frame_skip: int
     history: int = 0
+    past: int = 0
     num_states: int
     num_controls: int
     timestep: float | None
@@ -54,7 +57,7 @@ class Simulator(abc.ABC):
         Arguments are tensors, arrays or lists; the result is a tensor.
 
         Args:
-            states: initial states, ``(T, num_states)``, float64.
+            states: initial states, ``(T, num_states)``, float64, or after those of ``past`` steps before it.
             controls: the controls of each transition, after those of ``history`` steps before it,
                 ``(T, history + lag, num_controls)``.
             values: parameter vectors in their units, ``(K, d)``.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from dropo_torch.data.trajectory import states_before
 from dropo_torch.errors import InputError
 from dropo_torch.problem import Problem
 from dropo_torch.view.run import Candidate, Run
@@ -195,7 +196,10 @@ def open_loop(candidate: Candidate, stretch: Stretch) -> tuple[np.ndarray, np.nd
     for starts, lag in _groups(stretch):
         rows = stretch.first + starts[:, None] + np.arange(-simulator.history, lag)
         controls = log.actions[np.maximum(rows, stretch.begin)]
-        after = simulator.rollout(torch.from_numpy(begun[starts]), torch.from_numpy(controls), values)[:, 0]
+        given = begun[starts]
+        if (past := states_before(log, problem.observation, stretch.first + starts, simulator.past)) is not None:
+            given = np.concatenate([past[:], given[:, None]], 1)
+        after = simulator.rollout(torch.from_numpy(given), torch.from_numpy(controls), values)[:, 0]
         ends = starts[:, None] + np.arange(1, lag + 1)
         measured = torch.from_numpy(
             problem.observation.observed(log.next_observations[stretch.first + ends.ravel() - 1])
