@@ -316,8 +316,8 @@ class Effect(abc.ABC):
         return shown[:, column]
 
     def memory(self, values: np.ndarray) -> float:
-        """Return the seconds that :meth:`command` or :meth:`sense` looks back; infinite for all of the past."""
-        return math.inf if self.has("command") else 0.0
+        """Return the seconds that :meth:`command`, :meth:`sense` or :meth:`replay` looks back; infinite for all."""
+        return math.inf if self.has("command") or self.has("replay") else 0.0
 
     def has(self, method: Method) -> bool:
         """Whether the effect acts by a method."""

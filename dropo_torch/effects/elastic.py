@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
@@ -44,6 +46,8 @@ class JointElasticity(DrivenJointEffect):
 
     name = "joint_elasticity"
     positional = True
+    #: What is left of the rotor's state where it is taken for forgotten.
+    FORGOTTEN = 0.01
     sentence = "the transmission of {target} gives: a spring between its motor and the joint"
 
     @staticmethod
@@ -88,6 +92,16 @@ class JointElasticity(DrivenJointEffect):
         """Return the rotor's position and velocity, and whether they are known, ``(R, 3)``: the drive decides."""
         q, v = position[:, setting.coordinate(target)], velocity[:, setting.dof(target)]
         return np.stack([q, v, np.zeros_like(q)], 1)
+
+    def memory(self, values: np.ndarray) -> float:
+        """Return the time in which what the rotor was before decays to :attr:`FORGOTTEN`, were it not driven."""
+        compliance, damping, inertia = (float(x) for x in values)
+        if compliance == 0:
+            return 0.0
+        if damping == 0:
+            return math.inf
+        slow = max(2 * inertia / damping, damping * compliance)  # that of an oscillation, or of a creeping spring
+        return float(slow * -math.log(self.FORGOTTEN))
 
     def replay(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,

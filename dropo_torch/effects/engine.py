@@ -23,7 +23,7 @@ from dropo_torch.simulators.mujoco import default_row
 
 Models = Sequence[mujoco.MjModel | None]
 #: Seconds, and rows at most, before a simulation from which what an effect remembers is replayed.
-PAST, MOST_PAST = 1.0, 400
+PAST, MOST_PAST = 3.0, 1000
 #: Simulations below which handing work to threads costs more than it saves.
 ALONE = 200
 
@@ -97,14 +97,17 @@ class Past:
     commands: np.ndarray
 
 
-def past_rows(timestep: float) -> int:
-    """Return the rows before a simulation from which what an effect remembers is replayed, of ``timestep`` seconds."""
-    return min(math.ceil(PAST / timestep - 1e-9), MOST_PAST)
+def past_rows(memory: float, timestep: float) -> int:
+    """Return the rows, of ``timestep`` seconds, from which what an effect remembers for ``memory`` is replayed."""
+    return min(math.ceil(min(memory, PAST) / timestep - 1e-9), MOST_PAST)
 
 
-def remembered_from(lengths: np.ndarray, timestep: float) -> np.ndarray:
-    """Return the row of episodes, of so many ``(E,)``, from which on the log shows the past that effects remember."""
-    return np.minimum(past_rows(timestep), lengths // 4)
+def remembered_from(lengths: np.ndarray, rows: int) -> np.ndarray:
+    """Return the row of episodes, of so many ``(E,)``, from which on the log shows the past that effects remember.
+
+    That is the number of rows that they need, but no more than half an episode.
+    """
+    return np.minimum(rows, lengths // 2)
 
 
 def drives_of(forces: Iterable[Force], models: Models, each: int = 1) -> Drives | None:

@@ -303,14 +303,14 @@ def first_known(effects: EffectSet, space: ParameterSpace, log: Trajectories, ti
     """
     setting, commands = effects.setting, log.commands
     skip, lengths = setting.frame_skip, np.bincount(log.episodes)
+    past = past_rows(effects.having("replay").look_back(space), timestep)
     before = int(effects.having("sense").look_back(space) > 0)  # a late sensor asks for the command just before
 
     def needed(share: float) -> np.ndarray:
         placed = effects.at(space.low + share * (space.high - space.low))
         filters = placed_filters(placed, "command", setting)
         known = np.maximum(settled_after(commands, filters, skip, timestep / skip), before)
-        remembers = len(effects.having("replay"))
-        return np.maximum(known, remembered_from(lengths, timestep)) if remembers else known
+        return np.maximum(known, remembered_from(lengths, past))
 
     found = np.zeros_like(lengths)
     for share in SHARES:
@@ -366,7 +366,7 @@ def effect_simulator(
             return make(model, setting.frame_skip * finer, space.on(model))
         inner = make(model, finer, space.on(model))
         engine, kept, lead = outer_engine(effects.outer, inner), effects.outer, inner.history
-    past = past_rows(timestep) if len(kept.having("replay")) else 0
+    past = min(past_rows(kept.having("replay").look_back(space), timestep), longest)
     history = max(history_steps(kept, space, timestep, longest, lead), past)
     return EffectSimulator(
         engine, kept, parameters=space, history=history, past=past, lead=lead, timestep=timestep,

@@ -232,8 +232,7 @@ class Twin:
         skip, lengths = self.setting.frame_skip, np.full(len(commands), commands.shape[1])
         found = settled_after(commands, filters, skip, float(self.setting.model.opt.timestep))
         known = np.maximum(found, filters_known(self._engine.lead, skip, lengths))
-        remembers = any(p.effect.has("replay") for p in variant.placed)
-        return np.maximum(known, remembered_from(lengths, self.setting.signals.timestep)) if remembers else known
+        return np.maximum(known, remembered_from(lengths, self._rows_before(self.effects(variant))))
 
     def knows(self, variant: Variant, windows: Windows) -> np.ndarray:
         """Return whether all that acts in a window under a variant follows from the log, ``(W,)`` bool."""
@@ -295,13 +294,18 @@ class Twin:
         there = SensedPath.of(past, 1, self.setting.frame_skip, step, tuple(self.rates))
         return true + shown - sensed(there, sensors)[:, 0]
 
+    def _rows_before(self, placed: Sequence[Placed]) -> int:
+        """Rows before a window that tell what effects remember."""
+        seconds = max((p.effect.memory(np.array(p.values)) for p in placed if p.effect.has("replay")), default=0.0)
+        return past_rows(seconds, self.setting.signals.timestep)
+
     def _past(self, variants: Sequence[Variant], windows: Windows) -> Past | None:
         """Return what was before windows, where an effect remembers it and the log shows it."""
         if windows.observed is None or not any(v.has("replay") for v in variants):
             return None
         if self.setting.observation.loops is not None:
             return None
-        before, skip = past_rows(self.setting.signals.timestep), self.setting.frame_skip
+        before, skip = max(self._rows_before(v.placed) for v in variants), self.setting.frame_skip
         rows = min(before, int(windows.steps.max(initial=0)))
         at = windows.steps[:, None] + np.arange(-rows, 1)
         columns = windows.observed[windows.episodes[:, None], np.maximum(at, 0)]
