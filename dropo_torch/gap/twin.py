@@ -301,11 +301,11 @@ class Twin:
 
     def _past(self, variants: Sequence[Variant], windows: Windows) -> Past | None:
         """Return what was before windows, where an effect remembers it and the log shows it."""
-        if windows.observed is None or not any(v.has("replay") for v in variants):
+        before, skip = max(self._rows_before(v.placed) for v in variants), self.setting.frame_skip
+        if windows.observed is None or not before:
             return None
         if self.setting.observation.loops is not None:
             return None
-        before, skip = max(self._rows_before(v.placed) for v in variants), self.setting.frame_skip
         rows = min(before, int(windows.steps.max(initial=0)))
         at = windows.steps[:, None] + np.arange(-rows, 1)
         columns = windows.observed[windows.episodes[:, None], np.maximum(at, 0)]
