@@ -15,8 +15,9 @@ import numpy as np
 
 from dropo_torch.config import PLANNING_KEYS, TRAINING_KEYS, Config
 from dropo_torch.data.observation import Observation, generic_observation, parse_observation
-from dropo_torch.data.trajectory import Trajectories, make_transitions, with_unseen
+from dropo_torch.data.trajectory import Trajectories, make_transitions, with_slopes_before, with_unseen
 from dropo_torch.effects import find_effect, load_effects
+from dropo_torch.effects.base import applied
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator, first_known
 from dropo_torch.errors import InputError
@@ -30,6 +31,7 @@ from dropo_torch.logged import (
     log_of,
     used,
 )
+from dropo_torch.models.constants import velocity_lead
 from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
@@ -128,6 +130,7 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
         since = known if since is None else np.maximum(since, known)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
+    trajectories = with_slopes_before(trajectories, _lead(space.model, effects))
     trajectories = with_unseen(trajectories, observation, simulator.timestep, _ahead(space.model, frame_skip))
     lag = 1 if sensed else config.lag
     transitions = make_transitions(
@@ -137,6 +140,14 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
     return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects, since)
+
+
+def _lead(model: mujoco.MjModel | None, effects: EffectSet | None) -> float:
+    """By how many seconds the velocities of a simulation are those of before its positions, under the effects' step."""
+    if model is None:
+        return 0.0
+    steps = () if effects is None else effects.matching(lambda effect: effect.steps).at(np.empty(0))
+    return velocity_lead(applied(model, steps))
 
 
 def _ahead(model: mujoco.MjModel | None, frame_skip: int) -> float:

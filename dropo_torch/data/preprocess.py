@@ -400,7 +400,8 @@ class _Episode:
         log = Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
         sampled = [signals[name] for name in position] + [signals[n] if n in velocities else None for n in velocity]
         origin = Origin((*position, *velocity), tuple(actions))
-        return replace(log, origin=origin, gains=self._gains(sampled, grid))
+        slopes = tuple(len(position) + i for i, name in enumerate(velocity) if name not in velocities)
+        return replace(log, origin=origin, gains=self._gains(sampled, grid), slopes=slopes)
 
     def _gains(self, interpolated: Sequence[_Samples | None], grid: np.ndarray) -> np.ndarray | None:
         """Noise of columns before and after each transition, relative to a sample's ``(T, 2, n)``, if it is another."""

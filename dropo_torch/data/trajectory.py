@@ -62,6 +62,8 @@ class Trajectories(ByValue):
             :func:`with_unseen`. ``None`` where there are none.
         gains: noise of each column before and after each transition, relative to that of a sample, ``(T, 2, n)``: what
             lies between two samples has less. ``None`` where rows are samples.
+        slopes: numbers of the columns that are velocities derived from positions.
+        lead: seconds before each row at which these are taken; see :func:`with_slopes_before`.
 
     Raises:
         InputError: shapes that do not fit, a value that is not finite, no transition.
@@ -76,6 +78,8 @@ class Trajectories(ByValue):
     origin: Origin | None = None
     unseen: np.ndarray | None = None
     gains: np.ndarray | None = None
+    slopes: tuple[int, ...] = ()
+    lead: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("observations", "next_observations", "actions"):
@@ -194,6 +198,28 @@ def with_unseen(
     return replace(log, unseen=states[:, list(observation.unseen)])
 
 
+def with_slopes_before(log: Trajectories, lead: float) -> Trajectories:
+    """Return a log whose derived velocities are those of an instant before each row.
+
+    A semi-implicit simulation moves positions with the velocities after each of its steps h: along a motion its
+    velocities are those of h / 2 before its positions. One that begins with the velocities of a row itself is off by
+    h / 2 of acceleration for good.
+
+    Args:
+        log: the log.
+        lead: seconds before each row.
+    """
+    if not log.slopes or log.dt is None or lead == log.lead:
+        return log
+    columns, bounds = list(log.slopes), np.append(0, np.flatnonzero(log.terminals) + 1)
+    before, after = log.observations.copy(), log.next_observations.copy()
+    for a, b in itertools.pairwise(bounds):
+        path = np.concatenate([before[a:b, columns], after[b - 1 : b, columns]])
+        path = path + (log.lead - lead) * np.gradient(path, log.dt, axis=0)
+        before[a:b, columns], after[a:b, columns] = path[:-1], path[1:]
+    return replace(log, observations=before, next_observations=after, lead=lead)
+
+
 def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
     """Join several logs of the same columns; no window crosses from one into the next.
 
@@ -218,6 +244,8 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
         source=first.source if len(logs) == 1 else f"{first.source} and {len(logs) - 1} more",
         origin=Origin.joined([log.origin for log in logs]),
         gains=None if all(log.gains is None for log in logs) else np.concatenate(gains),
+        slopes=first.slopes,
+        lead=first.lead,
     )
 
 

@@ -90,7 +90,8 @@ class Setting:
     """Where effects are looked for: the model as given, the columns of the log (some masked), and its sizes.
 
     Of columns that are derived, ``derived`` has the errors, ``(column, error)`` each. Where the log's velocities are
-    ``differentiated`` positions, what a sensor does to a position shows in its velocity, too.
+    ``differentiated`` positions, what a sensor does to a position shows in its velocity, too. Columns ``slopes`` are
+    velocities that were derived from positions, those of ``lead`` seconds before each row.
     """
 
     model: mujoco.MjModel
@@ -100,6 +101,8 @@ class Setting:
     masked: frozenset[int] = frozenset()
     derived: tuple[tuple[int, float], ...] = ()
     differentiated: bool = False
+    slopes: tuple[int, ...] = ()
+    lead: float = 0.0
 
     @property
     def has_impacts(self) -> bool:

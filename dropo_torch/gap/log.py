@@ -161,7 +161,8 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     masked = masked_columns(observation, problem.config.mask)
     derived = tuple((observation.labels.index(label), error) for label, error in problem.derived.items())
     differentiated = problem.sensed is None and problem.config.derives_velocities
-    return Setting(model, observation, signals, frame_skip, masked, derived, differentiated)
+    slopes = tuple(i for i, column in enumerate(observation.log_columns) if column in log.slopes)
+    return Setting(model, observation, signals, frame_skip, masked, derived, differentiated, slopes, log.lead)
 
 
 def start_values(problem: Problem) -> np.ndarray:

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 import torch
 
@@ -22,6 +23,7 @@ from dropo_torch.effects.filters import (
     unsensed,
 )
 from dropo_torch.effects.path import SensedPath
+from dropo_torch.models.constants import velocity_lead
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.hidden import filters_known
 
@@ -182,7 +184,7 @@ class Twin:
             calls = parts(len(members), max(1, self._chunk // max(1, num_w)))
             for part, rows in itertools.product([members[c] for c in calls], parts(num_w, self._chunk)):
                 chosen, given = [variants[k] for k in part], windows.select(rows)
-                states = np.stack([self._states(variants[k], shown[k, rows], given) for k in part])
+                states = np.stack([self._states(variants[k], models[k], shown[k, rows], given) for k in part])
                 signals = np.stack([self._signals(v, given) for v in chosen])
                 forces = None if pushes is None else pushes[part]
                 own = [models[k] for k in part]
@@ -248,8 +250,10 @@ class Twin:
             valid[..., f.column] &= truth.known(f.effect.memory(f.values[0].numpy())).numpy()
         return sensed(truth, sensors).numpy(), valid
 
-    def _states(self, variant: Variant, shown: np.ndarray, windows: Windows) -> np.ndarray:
-        """Return states ``(W, nq + nv)`` of which the sensors show ``shown``."""
+    def _states(
+        self, variant: Variant, model: mujoco.MjModel | None, shown: np.ndarray, windows: Windows
+    ) -> np.ndarray:
+        """Return states ``(W, nq + nv)`` of which the sensors show ``shown``, to begin simulations of a model."""
         sensors, observation = placed_filters(variant.placed, "sense", self.setting), self.setting.observation
         rates = windows.rates.copy()
         for f in sensors:  # what a late sensor shows later is the truth of now
@@ -258,6 +262,9 @@ class Twin:
                 steps = late / self.setting.signals.timestep
                 rates[:, f.column] = secants(windows.measured[:, :, f.column], steps) / late
         true = self._true(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy()
+        if self.setting.slopes and model is not None:  # which were taken as the model as given begins
+            slopes = list(self.setting.slopes)
+            true[:, slopes] += (self.setting.lead - velocity_lead(model)) * rates[:, slopes]
         states = self._full(true, windows.unseen)
         for q in observation.quaternions:
             at = observation.index[list(q)]

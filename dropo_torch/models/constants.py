@@ -33,6 +33,14 @@ def slide_alone(model: mujoco.MjModel) -> np.ndarray:
     return np.asarray(alone)
 
 
+def velocity_lead(model: mujoco.MjModel) -> float:
+    """Return by how many seconds a simulation's velocities are those of before its positions: half a step, but of RK4.
+
+    All other integrators are semi-implicit: they move positions with the velocities after each step.
+    """
+    return 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5 * float(model.opt.timestep)
+
+
 def derive(model: mujoco.MjModel, data: mujoco.MjData | None = None) -> None:
     """Compute everything that follows from a model's numbers, in place.
 
