@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -166,7 +167,10 @@ def test_friction_can_be_found_however_little_the_model_has(friction: float) -> 
 MODELS = {
     "actuator_time_constant": RIG.replace(
         '<motor name="push"', '<general name="push" dyntype="filterexact" dynprm=".05"'
-    )
+    ),
+    "tendon_friction": RIG.replace(
+        "</mujoco>", '<tendon><fixed name="cable"><joint joint="shoulder" coef=".1"/></fixed></tendon></mujoco>'
+    ),
 }  # fmt: skip
 
 
@@ -257,6 +261,27 @@ def test_damping_of_an_actuator_is_that_of_the_tendon_it_pulls(actuator: str, te
         forces.append(data.qfrc_passive + data.qfrc_actuator)
     assert np.abs(forces[0]).max() > 1e-3
     np.testing.assert_allclose(forces[0], forces[1], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("tendon", ["flexor", "cable"])
+def test_friction_of_a_tendon_holds_it_and_brakes_it(tendon: str) -> None:
+    """It stops short pulls that are weaker, and takes its own force off stronger ones."""
+    effect, loss = find_effect("tendon_friction"), 5.0
+    model = mujoco.MjModel.from_xml_string(TENDONS.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'))
+    setting = plain_setting(model, parse_observation(model, None), 4, 0.3)
+    assert tendon in effect.targets(setting)
+    actuator, gear = ("flex", 3.0) if tendon == "flexor" else ("pull", 1.0)
+    speeds = {}
+    for friction, pull in ((loss, 0.9 * loss), (loss, 3 * loss), (0.0, 2 * loss)):
+        own = copy.copy(model)
+        effect.apply(own, tendon, np.array([friction]))
+        data = mujoco.MjData(own)
+        data.ctrl[own.actuator(actuator).id] = pull / gear
+        mujoco.mj_step(own, data, 5)
+        speeds[friction, pull] = data.ten_velocity[own.tendon(tendon).id]
+    held, braked, free = speeds.values()
+    assert abs(held) < 2e-3 * abs(free)
+    assert braked == pytest.approx(free, rel=0.02)
 
 
 def test_quadratic_drag_is_alike_in_all_directions() -> None:

@@ -37,7 +37,7 @@ from dropo_torch.proposal.matches import Match, unit_name
 from dropo_torch.proposal.matching import match_columns
 from dropo_torch.proposal.motions import motion
 from dropo_torch.proposal.places import command_kind, known_names, places_of
-from dropo_torch.proposal.words import read_name
+from dropo_torch.proposal.words import body_rates, read_name
 
 DEG = 180 / math.pi
 
@@ -132,6 +132,9 @@ def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, nam
         ("az_deg", "", math.pi / 180, ("az",), ()),
         ("az_rate", "velocity", None, ("az",), ()),
         ("az_torque", "effort", None, ("az",), ()),
+        ("Istwert_A1_deg", "", math.pi / 180, ("a",), (1,)),
+        ("Sollwert_A1_deg", "command", math.pi / 180, ("a",), (1,)),
+        ("Drehzahl_A1_degps", "velocity", math.pi / 180, ("a",), (1,)),
     ],
 )
 def test_names_say_what_people_mean(
@@ -168,6 +171,15 @@ def test_the_words_of_a_joints_name_say_nothing_else(name: str, role: str, objec
 def test_names_of_poses(name: str, axis: str, quaternion: bool, angular: bool) -> None:
     words = read_name(name)
     assert (words.axis, words.quaternion, words.angular) == (axis, quaternion, angular)
+
+
+def test_p_q_and_r_together_are_body_rates() -> None:
+    found = [read_name(name) for name in body_rates(["t", "p_degps", "q_degps", "r_degps", "qw"])]
+    assert [(w.axis, w.angular, w.scale) for w in found[1:4]] == [
+        (a, True, pytest.approx(math.pi / 180)) for a in "xyz"
+    ]
+    assert body_rates(["p", "q", "dq"]) == ["p", "q", "dq"]
+    assert body_rates(["p", "q", "q2", "r"])[0] == "p"
 
 
 # --- columns of a cart that nothing but a motor holds ---

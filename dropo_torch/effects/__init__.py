@@ -1,6 +1,7 @@
 """The physical effects that a model may lack, and how each enters a simulation.
 
-A new one is a class in the module of its kind: ``joint``, ``body``, ``world``, ``actuator``, ``sensor`` or ``contact``.
+A new one is a class in the module of its kind: ``joint``, ``tendon``, ``body``, ``world``, ``actuator``, ``sensor`` or
+``contact``.
 """
 
 from __future__ import annotations
@@ -8,13 +9,13 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Callable, Sequence
 
-from dropo_torch.effects import actuator, body, contact, elastic, joint, presliding, sensor, world
+from dropo_torch.effects import actuator, body, contact, elastic, joint, presliding, sensor, tendon, world
 from dropo_torch.effects.base import VOCABULARY, Effect, Placed, Quantity, Setting, Signals, find_effect
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.errors import InputError
 from dropo_torch.support.usercode import load_callable, user_code
 
-for _module in (joint, presliding, elastic, body, world, actuator, sensor, contact):
+for _module in (joint, presliding, elastic, tendon, body, world, actuator, sensor, contact):
     for _class in vars(_module).values():  # in the order in which they stand there
         if isinstance(_class, type) and issubclass(_class, Effect) and hasattr(_class, "name"):
             VOCABULARY[_class.name] = _class()

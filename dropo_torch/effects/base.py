@@ -20,7 +20,7 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import object_names, object_number
 
-Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]
+Kind = Literal["joint", "tendon", "body", "world", "actuator", "sensor", "geom"]
 #: The methods by which an effect acts on a simulation.
 Method = Literal["apply", "force", "force_under", "replay", "wrench", "command", "sense"]
 #: Share of its start that an amount is at least, where a prediction of places is divided by it.

@@ -94,14 +94,14 @@ class JointQuadraticDamping(AddedToJoint):
 
 
 #: Impedance of dry friction that hardly creeps, and its time constant in physics steps.
-_STUCK, _STEPS = (0.999, 0.9999, 0.001, 0.5, 2.0), 2.0
+STUCK, STEPS = (0.999, 0.9999, 0.001, 0.5, 2.0), 2.0
 
 
 def add_friction(model: mujoco.MjModel, dof: int, friction: float) -> None:
     """Add dry friction; where the model has none, with a constraint that hardly creeps while it sticks."""
     if model.dof_frictionloss[dof] == 0 and friction != 0:
-        model.dof_solimp[dof] = _STUCK
-        model.dof_solref[dof] = (_STEPS * model.opt.timestep, 1.0)
+        model.dof_solimp[dof] = STUCK
+        model.dof_solref[dof] = (STEPS * model.opt.timestep, 1.0)
     model.dof_frictionloss[dof] += friction
 
 

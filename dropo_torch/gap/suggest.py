@@ -44,6 +44,7 @@ MOTIONS = {
     "joint_stop": "",  # nothing says that there are any
     "armature": "accelerates these joints",
     "joint": "moves these joints further, faster and to and fro",
+    "tendon": "moves these tendons further and to and fro",
     "actuator_saturation": "asks for larger forces",
     "actuator": "commands these actuators more, and changes the commands faster",
     "sensor": "moves these columns further",

@@ -19,22 +19,25 @@ def _set(words: str) -> frozenset[str]:
 #: Words of names, by what they make of a column.
 _ROLES: dict[Role, frozenset[str]] = {
     "position": _set(
-        "q qpos pos position positions angle angles theta th phi psi alpha beta enc encoder pose p"
+        "q qpos pos position positions angle angles theta th phi psi alpha beta enc encoder pose p winkel lage"
     ),
     "velocity": _set(
-        "dq qd qdot qvel vel velo velocity velocities spd speed speeds omega dot rate v twist gyro angvel linvel"
+        "dq qd qdot qvel vel velo velocity velocities spd speed speeds omega dot rate v twist gyro angvel linvel "
+        "drehzahl geschwindigkeit vitesse"
     ),
     "acceleration": _set("ddq qdd qddot acc accel acceleration qacc"),
     "effort": _set(
-        "tau torque torques effort efforts force forces thrust tension tensions moment current curr load frc"
+        "tau torque torques effort efforts force forces thrust tension tensions moment current curr load frc "
+        "drehmoment kraft couple"
     ),
     "command": _set(
         "cmd cmds command commands commanded u ctrl control controls action actions act input inputs "
-        "target targets des desired ref reference setpoint setp goal sp pwm throttle duty"
+        "target targets des desired ref reference setpoint setp goal sp pwm throttle duty soll sollwert "
+        "sollwerte consigne"
     ),
     "time": _set(
         "t time times timestamp timestamps stamp clock sec secs seconds epoch unix utc elapsed uptime millis micros "
-        "nanos msec usec nsec"
+        "zeit nanos msec usec nsec"
     ),
     "episode": _set(
         "episode episodes ep run trial traj trajectory demo rollout segment take experiment"
@@ -52,11 +55,12 @@ _VOLTAGE, _SUPPLY, _IN_VOLTS = (
 #: A current, unless it stands beside a kind of motion: the one at present.
 _CURRENT = _set("current curr")
 #: Words of commands that are positions to be reached.
-_TARGETS = _set("target targets des desired ref reference setpoint setp goal sp")
+_TARGETS = _set("target targets des desired ref reference setpoint setp goal sp soll sollwert sollwerte consigne")
 #: Words of units → what the value is multiplied by to be SI.
 UNITS: dict[str, float] = {
     "deg": math.pi / 180, "degs": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180,
-    "dps": math.pi / 180, "rpm": math.pi / 30, "rad": 1.0, "rads": 1.0, "radian": 1.0, "radians": 1.0, "mm": 1e-3,
+    "dps": math.pi / 180, "degps": math.pi / 180, "radps": 1.0, "rpm": math.pi / 30, "rad": 1.0, "rads": 1.0,
+    "radian": 1.0, "radians": 1.0, "mm": 1e-3,
     "mmps": 1e-3, "cm": 1e-2, "meter": 1.0, "meters": 1.0, "nm": 1.0, "newton": 1.0, "mnm": 1e-3,
 }  # fmt: skip
 #: Words of hundredths of a range, and of what is so commanded.
@@ -66,7 +70,7 @@ _ACT = "act"
 #: Units that count only as a name's last word: they are letters with other meanings, too.
 _LAST = {"m": 1.0, "s": 1.0, "n": 1.0, "mps": 1.0}
 #: Units of velocities, of efforts, and of which names do not tell; others are of positions.
-_RATES, _EFFORTS, _EITHER = _set("dps rpm mmps mps"), _set("nm mnm newton n"), _set("degs rads s")
+_RATES, _EFFORTS, _EITHER = _set("dps degps radps rpm mmps mps"), _set("nm mnm newton n"), _set("degs rads s")
 #: Units of time stamps → seconds.
 TIME_UNITS = {
     "s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "millis": 1e-3,
@@ -80,7 +84,7 @@ _TURNS = _set("angle angles theta th phi psi alpha beta thetadot phidot dtheta d
 #: Words that tell nothing.
 _EMPTY = _set(
     "joint joints jnt state states data sensor sensors robot measured meas actual present value values body link obs "
-    "observation observations header log signal motor servo of the"
+    "observation observations header log signal motor servo of the ist istwert istwerte messwert achse mesure"
 )
 #: Words of quaternions, and of linear and angular velocities.
 _QUATERNION = _set("quat quaternion orientation rot rotation ori")
@@ -249,6 +253,28 @@ def desired(names: Sequence[str], alike: Callable[[int, int], bool]) -> list[str
         if words.count("d") == 1 and bare in every and alike(i, every[bare]):
             found[i] = " ".join("des" if word == "d" else word for word in words)
     return found
+
+
+def body_rates(names: Sequence[str]) -> list[str]:
+    """Return names in which lone letters ``p``, ``q`` and ``r``, where each stands once, are gyroscopes' axes.
+
+    So flight logs call the angular velocities about a body's axes; where only some stand, ``q`` is a position.
+
+    Args:
+        names: of columns.
+    """
+    bare = [[w for w in _unit(split(name))[0] if not w.isdigit()] for name in names]
+    axes = {letter: [i for i, words in enumerate(bare) if words == [letter]] for letter in "pqr"}
+    found = list(names)
+    if all(len(at) == 1 for at in axes.values()):
+        for letter, axis in zip("pqr", _AXES, strict=True):
+            found[axes[letter][0]] = f"gyro {axis} {_unit_words(names[axes[letter][0]])}".strip()
+    return found
+
+
+def _unit_words(name: str) -> str:
+    every = split(name)
+    return " ".join((Counter(every) - Counter(_unit(every)[0])).elements())
 
 
 def actual(names: Sequence[str], words: Sequence[Words]) -> list[str]:

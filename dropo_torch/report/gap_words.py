@@ -34,6 +34,7 @@ _NOUNS = {
     "joint_friction_slope": "dry friction in {0} that changes along its range",
     "joint_load_friction": "dry friction in {0} that grows with the force that drives it",
     "joint_elasticity": "a transmission of {0} that gives (elasticity between motor and joint)",
+    "tendon_friction": "dry (Coulomb) friction along {0}",
     "joint_stiffness": "a spring at {0}",
     "joint_cogging": "a force at {0} that is periodic in its position (cogging)",
     "armature": "rotor or gear inertia (armature) at {0}",
@@ -99,7 +100,7 @@ _CLAUSES = {
 }
 #: Effects whose first number, if negative, says that the model has too much of them.
 _SIGNED = ("joint_damping", "joint_quadratic_damping", "joint_friction", "joint_stiffness", "armature",
-           "actuator_damping")  # fmt: skip
+           "actuator_damping", "tendon_friction")  # fmt: skip
 #: Effects whose number is a multiple of what the model has.
 _MULTIPLES = ("actuator_gain", "actuator_stiffness", "inertia")
 #: Members of the base family, in a list of a joint's.
@@ -462,7 +463,8 @@ def _at(effect: str, target: str | None) -> str:
         return "the world"
     if target == "*":
         return _all(effect)
-    return f"actuator {target}" if effect.startswith("actuator_") else target
+    kind = effect.split("_")[0]
+    return f"{kind} {target}" if kind in ("actuator", "tendon") else target
 
 
 def _all(effect: str) -> str:
