@@ -141,19 +141,46 @@ def test_models_of_one_structure_share_their_tables() -> None:
     assert sum(tables is not None for tables in known.values()) > 0.9 * len(known)
 
 
+def test_principal_axes_stand_in_theta() -> None:
+    """Bodies whose inertias are turned share an engine, and each moves as MuJoCo has it."""
+    spec = mujoco.MjSpec.from_string(ROUND)
+    for body in spec.bodies[1:]:
+        body.simple = 0
+    model = spec.compile()
+    model.body_sameframe[:] = model.geom_sameframe[:] = 0
+    rng, turned = np.random.default_rng(0), []
+    for _ in range(3):
+        own = copy.copy(model)
+        own.body_inertia[1:] *= (1.0, 1.5, 1.9)
+        own.body_iquat[1:] = rng.normal(size=(model.nbody - 1, 4))
+        own.body_iquat[1:] /= np.linalg.norm(own.body_iquat[1:], axis=1, keepdims=True)
+        mujoco.mj_setConst(own, mujoco.MjData(own))
+        turned.append(own)
+    worlds = Variants(ParameterSpace(model, MASS), num_threads=1).worlds(turned, 1)
+    assert len(worlds.engines) == 1
+    start = np.concatenate([model.qpos0, rng.normal(0, 0.5, model.nv)])
+    path = worlds.rollout(np.tile(start, (3, 1)), np.zeros((3, 20, model.nu)), 1)
+    for own, found in zip(turned, path, strict=True):
+        data = mujoco.MjData(own)
+        data.qpos[:], data.qvel[:] = np.split(start, [model.nq])
+        for _ in range(20):
+            mujoco.mj_step(own, data)
+        np.testing.assert_allclose(found[-1], np.concatenate([data.qpos, data.qvel]), rtol=1e-8, atol=1e-9)
+    assert np.abs(path[0, -1] - path[1, -1]).max() > 1e-4
+
+
 def test_variants_share_the_arrays_that_they_have_in_common() -> None:
     """Tables are only read, so that one array serves all models with its content; others have their own."""
     model = mujoco.MjModel.from_xml_string(ROUND)
     longer = copy.copy(model)
     longer.opt.timestep = 0.5 * model.opt.timestep
-    longer.body_iquat[1] = [0.6, 0.8, 0, 0]
-    longer.body_simple[1] = longer.body_sameframe[1] = 0
+    longer.body_quat[2] = [0.6, 0.8, 0, 0]
     space = ParameterSpace(model, MASS)
     first, second = (Variants(space, num_threads=1).worlds([m], 1).engines[0][0].tables for m in (model, longer))
     assert first.h != second.h
     assert first.body_parent is second.body_parent
-    assert first.body_imat is not second.body_imat
-    assert not np.array_equal(first.body_imat.numpy(), second.body_imat.numpy())
+    assert first.body_mat is not second.body_mat
+    assert not np.array_equal(first.body_mat.numpy(), second.body_mat.numpy())
 
 
 def test_effects_are_written_in_any_order() -> None:

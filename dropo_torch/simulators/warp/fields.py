@@ -18,13 +18,13 @@ from dropo_torch.models.constants import slide_alone
 from dropo_torch.models.contacts import mixing
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.couplings import equality_bodies, has_dofs, welds
-from dropo_torch.simulators.warp.layout import ADDED, DIRECT, FRAMES, MIXED, PAIR
-from dropo_torch.simulators.warp.varied import Frames, Pose, Section
+from dropo_torch.simulators.warp.layout import ADDED, DIRECT, FRAMES, INERTIAL, MIXED, PAIR
+from dropo_torch.simulators.warp.varied import Frames, Pose, Section, matrices, unit
 from dropo_torch.support.threads import single_thread
 
 _INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature", "tendon_armature"})
 #: The fields that are read: name of the section, field, columns kept of each row (0: all).
-_READ = (*DIRECT, *((field, field, 0) for field in (*MIXED, *FRAMES, *ADDED)))
+_READ = (*DIRECT, *((field, field, 0) for field in (*MIXED, *FRAMES, *ADDED, INERTIAL)))
 #: Frames that the inverse weights depend on.
 _POSED = frozenset({"body_pos", "body_quat", "jnt_axis", "jnt_pos"})
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -67,6 +67,7 @@ class Fields:
         widths = {f"pair_{name}": width * len(pairs) for name, width in PAIR.items()}
         widths |= {"dof_invweight": model.nv, "weld_invweight": 2 * len(welds(model)), "ten_invweight": model.ntendon}
         rows = {kind: len(own) for kind, own in self._frames.rows.items()}
+        widths["imat"] = 9 * model.nbody
         widths |= {"body_frame": 7 * rows["body"], "link_frame": 6 * rows["jnt"], "geom_frame": 10 * rows["geom"]}
         for name, width in widths.items():
             self.sections[name] = (self.size, width)
@@ -75,7 +76,7 @@ class Fields:
         self._targets(space, columns)
         posed = bool(_POSED & set(space.fields))
         self._derive: tuple[Callable[[Section], torch.Tensor], ...]
-        self._derive = (_Mixing(model, pairs), _Weights(model, pairs, posed=posed), self._frames)
+        self._derive = (_Mixing(model, pairs), _Weights(model, pairs, posed=posed), _principal_axes, self._frames)
         self._constant = self._derived(self._raw[None])
 
     def _targets(self, space: ParameterSpace, columns: dict[str, np.ndarray]) -> None:
@@ -86,10 +87,11 @@ class Fields:
         self._factors = torch.tensor([t.factor for _, t in targets], dtype=torch.float64)
         self._sources = torch.tensor([source for source, _ in targets], dtype=torch.long)
         inertial = _INERTIAL | _POSED | ({"actuator_armature", "actuator_gear"} if len(self._adding.factors) else set())
-        self._varies = tuple(bool(fields & set(causes)) for causes in (MIXED, inertial, FRAMES))
+        self._varies = tuple(bool(fields & set(causes)) for causes in (MIXED, inertial, (), FRAMES))
         derived = (
             [f"pair_{name}" for name in PAIR if name != "invweight"],
             ["pair_invweight", "dof_invweight", "weld_invweight", "ten_invweight"],
+            ["imat"],
             ["body_frame", "link_frame", "geom_frame"],
         )
         own = [self.columns(n) for names, varies in zip(derived, self._varies, strict=True) if varies for n in names]
@@ -211,6 +213,11 @@ class _Mixing:
         return torch.cat([p.flatten(1) for p in parts], dim=1)
 
 
+def _principal_axes(section: Section) -> torch.Tensor:
+    """Rotations of the inertial frames of bodies, ``(K, 9 nbody)``."""
+    return matrices(unit(section(INERTIAL))).flatten(1)
+
+
 class _Anchors:
     """What ``mj_setConst`` makes of a connect's data: the anchor in the second body, from that in the first.
 
@@ -256,8 +263,7 @@ class _Weights:
         jac = np.zeros((2, model.nbody, 3, model.nv))
         for b in range(1, model.nbody):
             mujoco.mj_jac(model, data, jac[0, b], jac[1, b], data.xpos[b], b)
-        frames = (torch.tensor(x).reshape(1, -1, 3, 3) for x in (data.xmat, data.ximat))
-        self.pose = *torch.from_numpy(jac)[:, None], *frames
+        self.pose = *torch.from_numpy(jac)[:, None], torch.tensor(data.xmat).reshape(1, -1, 3, 3)
         self.varying = Pose(model) if posed else None
         mujoco.mj_tendon(model, data)
         self.arms = torch.zeros(model.ntendon, model.nv, dtype=torch.float64)
@@ -281,7 +287,8 @@ class _Weights:
         A pair's is the sum of its two bodies' for translations, a weld has that and the one for rotations.
         """
         mass, armature, inertia = section("mass")[..., 0], section("armature")[..., 0], section("inertia")
-        linear, angular, rotation, principal = self.varying(section) if self.varying else self.pose
+        linear, angular, rotation = self.varying(section) if self.varying else self.pose
+        principal = rotation @ matrices(unit(section(INERTIAL)))
         arm = (rotation @ section("ipos")[..., None]).expand(len(mass), -1, -1, angular.shape[-1])
         angular = angular.expand_as(arm)
         linear = linear + torch.linalg.cross(angular, arm, dim=2)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.spatial import ang, at, pull, theta_vec3
+from dropo_torch.simulators.warp.spatial import ang, at, pull, theta_mat33, theta_vec3
 from dropo_torch.simulators.warp.types import HALF, MINVAL, THREE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 PI = wp.constant(wp.float64(wp.pi))
@@ -68,7 +68,7 @@ def box_power(w: vec3, v: vec3, lw: vec3, lv: vec3, x: vec3, mass: f64, density:
 @wp.func(inline=True)
 def inertial_frame(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat33:
     """Rotation of the inertial frame of a body."""
-    return w.xmat[w.t, b] * m.body_imat[b]
+    return w.xmat[w.t, b] * theta_mat33(w.th, m.o_imat + 9 * b)
 
 
 @wp.func(inline=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.ellipsoid import ellipsoids_wrench
-from dropo_torch.simulators.warp.fluid import fluid_wrench
+from dropo_torch.simulators.warp.fluid import fluid_wrench, inertial_frame
 from dropo_torch.simulators.warp.frames import body_position, body_rotation, link_axis, link_position
 from dropo_torch.simulators.warp.parts import has_medium
 from dropo_torch.simulators.warp.rotations import quat_matrix, rotation
@@ -103,7 +103,7 @@ def sweep_out(m: wp.ref[Tables], w: wp.ref[World], r: int):
         if m.body_massive[b] != 0:
             c = pos + rot * theta_vec3(w.th, m.o_ipos + 3 * b)
             moments = theta_vec3(w.th, m.o_inertia + 3 * b)
-            w.inertia[w.t, b] = inertia_about_origin(w.th[m.o_mass + b], c, rot * m.body_imat[b], moments)
+            w.inertia[w.t, b] = inertia_about_origin(w.th[m.o_mass + b], c, inertial_frame(m, w, b), moments)
         else:
             w.inertia[w.t, b] = vec10()
 

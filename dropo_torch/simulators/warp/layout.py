@@ -32,6 +32,8 @@ MIXED = (
 ADDED = {
     "actuator_damping": "dof_damping", "actuator_dampingpoly": "dof_dampingpoly", "actuator_armature": "dof_armature",
 }  # fmt: skip
+#: Frames of the inertias, that no parameter writes: they stand in θ as rotations.
+INERTIAL = "body_iquat"
 #: Fields of frames, those of bodies, joints and geoms: in θ stand those that vary.
 FRAMES = ("body_pos", "body_quat", "jnt_axis", "jnt_pos", "geom_pos", "geom_quat", "geom_size")
 #: Numbers of a pair of geoms: what is mixed, and the sum of the two bodies' inverse weights.
@@ -41,5 +43,5 @@ FIELDS = (*(field for _, field, _ in DIRECT), *MIXED, *FRAMES, *ADDED)
 #: All sections of θ, in order.
 SECTIONS = (
     *(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight", "weld_invweight",
-    "ten_invweight", "body_frame", "link_frame", "geom_frame",
+    "ten_invweight", "imat", "body_frame", "link_frame", "geom_frame",
 )  # fmt: skip

@@ -29,6 +29,12 @@ def theta_vec3(th: Reals, i: int) -> vec3:
 
 
 @wp.func(inline=False)
+def theta_mat33(th: Reals, i: int) -> mat33:
+    """Nine consecutive numbers of θ, row by row."""
+    return mat33(th[i], th[i + 1], th[i + 2], th[i + 3], th[i + 4], th[i + 5], th[i + 6], th[i + 7], th[i + 8])
+
+
+@wp.func(inline=False)
 def theta_vec4(th: Reals, i: int) -> vec4:
     """Four consecutive numbers of θ."""
     return vec4(th[i], th[i + 1], th[i + 2], th[i + 3])

@@ -224,7 +224,7 @@ def _inertia_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, x: vec6, y: ve
         cbar = wp.cross(yc, ang(x)) + wp.cross(xc, ang(y)) + wp.cross(vc, ang(z)) + wp.cross(zc, ang(v))
         add_at(w.grad, w.t, m.o_ipos + 3 * b, wp.transpose(rot) * (cbar * w.th[m.o_mass + b]))
     if m.want_inertia != 0:
-        frame = wp.transpose(rot * m.body_imat[b])
+        frame = wp.transpose(inertial_frame(m, w, b))
         moments = wp.cw_mul(frame * ang(x), frame * ang(y)) + wp.cw_mul(frame * ang(z), frame * ang(v))
         add_at(w.grad, w.t, m.o_inertia + 3 * b, moments)
 

@@ -153,7 +153,7 @@ def _bodies(model: mujoco.MjModel) -> dict[str, Any]:
         "body_dof": np.maximum(model.body_dofadr, 0),
         "body_lastdof": last, "body_massive": moving.astype(np.int32), "body_pose": poses,
         "body_pos": pos, "body_mat": _matrices(quat),
-        "body_imat": _matrices(model.body_iquat), "dof_body": model.dof_bodyid, "dof_ndof": _link_dofs(model),
+        "dof_body": model.dof_bodyid, "dof_ndof": _link_dofs(model),
         "dof_alone": model.M_rownnz == 1,
         "dof_parent": np.stack([model.dof_parentid, np.arange(model.nv) - 1]),
     }  # fmt: skip

@@ -112,7 +112,7 @@ _VECTORS = (
     "poly_normal", "weld_pos", "seg_pos", "act_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass",
     "fluid_inertia",
 )  # fmt: skip
-_ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat", "act_mat")
+_ROTATIONS = ("body_mat", "geom_mat", "weld_mat", "act_mat")
 
 #: Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, offsets in θ.
 Tables: Any = _struct(

@@ -14,7 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.warp.engine import Batch, Engine
-from dropo_torch.simulators.warp.layout import FIELDS, FRAMES
+from dropo_torch.simulators.warp.layout import FIELDS, FRAMES, INERTIAL
 from dropo_torch.simulators.warp.support import remarks
 from dropo_torch.simulators.warp.varied import inertial_frames
 
@@ -161,7 +161,8 @@ def tabled_fields(model: mujoco.MjModel) -> tuple[str, ...]:
     arrays = [name for name in dir(model) if not name.startswith(("_", *_IDLE)) and name not in _DERIVED]
     arrays = [name for name in arrays if isinstance(found := getattr(model, name), np.ndarray) and found.size]
     options = [f"opt.{name}" for name in dir(model.opt) if not name.startswith("_")]
-    return tuple(field for field in (*options, *arrays) if field not in FIELDS or field in FRAMES)
+    in_theta = {*FIELDS, INERTIAL} - {*FRAMES}
+    return tuple(field for field in (*options, *arrays) if field not in in_theta)
 
 
 def _in_theta(space: ParameterSpace) -> dict[str, list[int]]:

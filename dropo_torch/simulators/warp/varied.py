@@ -98,13 +98,9 @@ class Pose:
             self.carries[b] = self.carries[model.body_parentid[b]]
             if model.body_dofnum[b]:
                 self.carries[b, own] = True
-        self.inertial = matrices(torch.from_numpy(model.body_iquat))
 
     def __call__(self, section: Section) -> tuple[torch.Tensor, ...]:
-        """Return Jacobians of the bodies' origins and rotations, rotations, and those of inertial frames.
-
-        All of them ``(K, nbody, 3, nv)`` or ``(K, nbody, 3, 3)``.
-        """
+        """Return Jacobians of the bodies' origins and rotations, ``(K, nbody, 3, nv)``, and rotations."""
         model, place, turn = self.model, section("body_pos"), matrices(unit(section("body_quat")))
         axes, anchors = unit(section("jnt_axis")), section("jnt_pos")
         pos, rot = [torch.zeros_like(place[:, 0])], [torch.eye(3, dtype=torch.float64).expand(len(place), 3, 3)]
@@ -139,7 +135,7 @@ class Pose:
         origins, rotation = torch.stack(pos, 1), torch.stack(rot, 1)
         linear = torch.stack(shift, -1)[:, None] * self.carries[:, None]
         linear = linear + torch.linalg.cross(angular, origins[..., None].expand_as(angular), dim=2)
-        return linear, angular, rotation, rotation @ self.inertial
+        return linear, angular, rotation
 
 
 def unit(x: torch.Tensor) -> torch.Tensor:
