@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo gap``, which writes ``gap.json``, report, picture, and the model and config with what it found."""
     from dropo_torch.gap import add, as_given, find_gap, find_gap_as_given, prepare
+    from dropo_torch.gap.run import SEARCHED
     from dropo_torch.gap.time_left import TimeLeft
     from dropo_torch.problem import logged_data, make_problem
     from dropo_torch.report import write_gap_picture, write_gap_report
@@ -57,7 +58,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     problem = make_problem(config, general=True)
     check_first(logged_data(problem), console, force=given.force)
     store = out / "gap-progress.bin"
-    with StageProgress(console, "gap", TimeLeft(given.time_limit)) as progress:
+    with StageProgress(console, "gap", TimeLeft(SEARCHED * given.time_limit)) as progress:
         progress.show("preparing", 0.0)
         problem = posed(problem)
         first = config.as_given and bool(problem.space.names)

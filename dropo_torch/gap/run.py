@@ -49,6 +49,8 @@ from dropo_torch.support.threads import single_thread
 RARE = "-rare"
 #: Suffix of the checkpoint of a search without the spans in which something pushed.
 CALM = "-calm"
+#: Share of a time limit after which no more is looked for: what was found is then fitted and verified.
+SEARCHED = 0.85
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
@@ -145,14 +147,15 @@ def find_gap(
         resume: go on from it.
         report: called with a stage and its share done.
         scene: what :func:`prepare` made of the problem; made here by default.
-        time_limit: seconds after which no more effects are looked for. What was found until then is judged, and
-            ``unfinished`` says what was not tried; it depends on how fast the machine is.
+        time_limit: seconds that it may take, about. After :data:`SEARCHED` of them no more effects are looked for: what
+            was found until then is judged, and ``unfinished`` says what was not tried; it depends on how fast the
+            machine is.
 
     Raises:
         InputError: a log or simulator in which nothing can be looked for (see :func:`prepare`), an empty vocabulary, or
             a checkpoint of another search.
     """
-    started, end = time.perf_counter(), time.monotonic() + time_limit
+    started, end = time.perf_counter(), time.monotonic() + SEARCHED * time_limit
     report("preparing", 0.0)
     scene = _ruled(scene or prepare(problem, rules), rules)
     scene, pushes = undisturbed(scene, scene.begin, scene.noise)
