@@ -178,6 +178,7 @@ def test_p_q_and_r_together_are_body_rates() -> None:
     assert [(w.axis, w.angular, w.scale) for w in found[1:4]] == [
         (a, True, pytest.approx(math.pi / 180)) for a in "xyz"
     ]
+    assert body_rates(["p", "q", "r"], ["P", "knee"]) == ["p", "q", "r"]
     assert body_rates(["p", "q", "dq"]) == ["p", "q", "dq"]
     assert body_rates(["p", "q", "q2", "r"])[0] == "p"
 

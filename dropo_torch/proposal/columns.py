@@ -160,7 +160,7 @@ def _understood(columns: Sequence[Column], known: Sequence[str]) -> list[Column]
             return False
         return bool(np.corrcoef(one[known], other[known])[0, 1] > ALIKE)
 
-    names = body_rates(desired(names, alike))
+    names = body_rates(desired(names, alike), known)
     names = actual(names, [read_name(name, known) for name in names])
     return [replace(c, words=read_name(name, known)) for c, name in zip(columns, names, strict=True)]
 

@@ -255,18 +255,19 @@ def desired(names: Sequence[str], alike: Callable[[int, int], bool]) -> list[str
     return found
 
 
-def body_rates(names: Sequence[str]) -> list[str]:
+def body_rates(names: Sequence[str], known: Sequence[str] = ()) -> list[str]:
     """Return names in which lone letters ``p``, ``q`` and ``r``, where each stands once, are gyroscopes' axes.
 
     So flight logs call the angular velocities about a body's axes; where only some stand, ``q`` is a position.
 
     Args:
         names: of columns.
+        known: names of the model's objects, which they may be, too.
     """
     bare = [[w for w in _unit(split(name))[0] if not w.isdigit()] for name in names]
     axes = {letter: [i for i, words in enumerate(bare) if words == [letter]] for letter in "pqr"}
     found = list(names)
-    if all(len(at) == 1 for at in axes.values()):
+    if all(len(at) == 1 for at in axes.values()) and not axes.keys() & {name.lower() for name in known}:
         for letter, axis in zip("pqr", _AXES, strict=True):
             found[axes[letter][0]] = f"gyro {axis} {_unit_words(names[axes[letter][0]])}".strip()
     return found
