@@ -76,7 +76,7 @@ class Problem:
 
     @property
     def left_out(self) -> int:
-        """Transitions in which commands from before the log act, so that the likelihood leaves them out."""
+        """Transitions in which commands or motion from before the log act, so that the likelihood leaves them out."""
         return 0 if self.since is None else int(self.since.sum())
 
 

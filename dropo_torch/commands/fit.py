@@ -164,8 +164,8 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
 
 def _left_out(problem: Problem) -> str:
     return (
-        f"{problem.left_out} transitions are left out: commands from before the log still act in them, by a delay, a "
-        "lag or play."
+        f"{problem.left_out} transitions are left out: commands or motion from before the log still act in them, by a "
+        "delay, a lag, play or a transmission that gives."
     )
 
 
