@@ -37,7 +37,7 @@ from dropo_torch.proposal.matches import Match, unit_name
 from dropo_torch.proposal.matching import match_columns
 from dropo_torch.proposal.motions import motion
 from dropo_torch.proposal.places import command_kind, known_names, places_of
-from dropo_torch.proposal.words import body_rates, read_name
+from dropo_torch.proposal.words import actual, body_rates, read_name
 
 DEG = 180 / math.pi
 
@@ -181,6 +181,18 @@ def test_p_q_and_r_together_are_body_rates() -> None:
     assert body_rates(["p", "q", "r"], ["P", "knee"]) == ["p", "q", "r"]
     assert body_rates(["p", "q", "dq"]) == ["p", "q", "dq"]
     assert body_rates(["p", "q", "q2", "r"])[0] == "p"
+
+
+def test_act_says_what_was_measured_where_nothing_else_does() -> None:
+    """Beside a position of the same joint it is the command, as in data sets of imitation."""
+
+    def told(*names: str) -> list[str]:
+        return [read_name(n).role for n in actual(names, [read_name(n) for n in names])]
+
+    assert told("elbow_ActPos_deg", "elbow_Torque_Nm") == ["position", "effort"]
+    assert told("elbow_pos", "elbow_act_pos") == ["position", "command"]
+    assert told("elbow_actVel", "elbow_pos") == ["velocity", "position"]
+    assert told("act_pos", "cmd_pos") == ["position", "command"]
 
 
 # --- columns of a cart that nothing but a motor holds ---

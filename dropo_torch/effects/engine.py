@@ -358,7 +358,7 @@ class VariantEngine:
         return out.reshape(num_k, num_w, *out.shape[1:])
 
     def _replay(self, forces: Sequence[Force], drives: Drives | None, past: Past | None) -> None:
-        """Let forces remember the past, each in its rows."""
+        """Let forces remember the past, each in its rows, and as far back as its own numbers do, whatever is known."""
         if past is None or drives is None:
             return
         (num_k, num_w, count, _), nq, row = past.commands.shape, self._base.nq, self._setting.signals.timestep
@@ -367,7 +367,10 @@ class VariantEngine:
         drive = Drive(drives, commands, row)
         for f in forces:
             if f.effect.has("replay"):
-                own = self._setting, f.target, f.values, states[f.rows, :, :nq], states[f.rows, :, nq:]
+                rows = [past_rows(f.effect.memory(values), row) for values in f.values[::num_w]]
+                forgotten = np.arange(count + 1) < count - np.repeat(rows, num_w)[:, None]
+                seen = np.where(forgotten[..., None], np.nan, states[f.rows])
+                own = self._setting, f.target, f.values, seen[..., :nq], seen[..., nq:]
                 f.memory.now = f.effect.replay(*own, drive.at(f.rows))
 
     def _begin(

@@ -279,7 +279,8 @@ def _unit_words(name: str) -> str:
 
 
 def actual(names: Sequence[str], words: Sequence[Words]) -> list[str]:
-    """Return names without ``act`` where that says what was measured: another column has the command.
+    """Return names without ``act`` where that says what was measured: another column has the command, or none else has
+    this position or velocity, which a log of commands alone would lack.
 
     Args:
         names: of columns.
@@ -290,9 +291,12 @@ def actual(names: Sequence[str], words: Sequence[Words]) -> list[str]:
         for n, w in zip(names, words, strict=True)
         if w.role == "command" and _ACT not in split(n)
     }
+    measured = {(w.role, w.objects, w.numbers) for w in words if w.role in ("position", "velocity", "")}
     found = []
     for name, told in zip(names, words, strict=True):
-        is_measured = _ACT in split(name) and (told.objects, told.numbers) in commanded
+        of = told.objects, told.numbers
+        alone = told.commanded in ("position", "velocity") and not {(told.commanded, *of), ("", *of)} & measured
+        is_measured = _ACT in split(name) and (of in commanded or alone)
         found.append(" ".join(word for word in split(name) if word != _ACT) if is_measured else name)
     return found
 
