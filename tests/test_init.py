@@ -37,7 +37,7 @@ from dropo_torch.proposal.matches import Match, unit_name
 from dropo_torch.proposal.matching import match_columns
 from dropo_torch.proposal.motions import motion
 from dropo_torch.proposal.places import command_kind, known_names, places_of
-from dropo_torch.proposal.words import actual, body_rates, read_name
+from dropo_torch.proposal.words import actual, body_rates, by_family, read_name
 
 DEG = 180 / math.pi
 
@@ -181,6 +181,17 @@ def test_p_q_and_r_together_are_body_rates() -> None:
     assert body_rates(["p", "q", "r"], ["P", "knee"]) == ["p", "q", "r"]
     assert body_rates(["p", "q", "dq"]) == ["p", "q", "dq"]
     assert body_rates(["p", "q", "q2", "r"])[0] == "p"
+
+
+def test_a_family_may_be_called_after_what_measures_it() -> None:
+    joints = ["sled", "sled_x", "sled_y", "sled_yaw", "table"]
+    assert by_family(["t", "cam_x_mm", "cam_y_mm", "cam_yaw_mrad"], joints)[1:] == [
+        "sled x mm",
+        "sled y mm",
+        "sled yaw mrad",
+    ]
+    for others in (["cam_x", "cam_y", "cam_z"], ["cam_x", "cam_y"], ["cam_x", "cam_y", "cam_yaw", "sled_vx"]):
+        assert by_family(others, joints) == others
 
 
 def test_act_says_what_was_measured_where_nothing_else_does() -> None:

@@ -18,7 +18,7 @@ from dropo_torch.data.readers import matching_paths
 from dropo_torch.data.streams import TIME
 from dropo_torch.data.tables import Choice, Table, missing, numbers
 from dropo_torch.errors import InputError
-from dropo_torch.proposal.words import Words, actual, body_rates, desired, read_name
+from dropo_torch.proposal.words import Words, actual, body_rates, by_family, desired, read_name
 from dropo_torch.support.given import MOST_TEXT
 
 #: Columns of a matrix beyond which it is a picture or a cloud of points, and no state.
@@ -160,7 +160,7 @@ def _understood(columns: Sequence[Column], known: Sequence[str]) -> list[Column]
             return False
         return bool(np.corrcoef(one[known], other[known])[0, 1] > ALIKE)
 
-    names = body_rates(desired(names, alike), known)
+    names = by_family(body_rates(desired(names, alike), known), known)
     names = actual(names, [read_name(name, known) for name in names])
     return [replace(c, words=read_name(name, known)) for c, name in zip(columns, names, strict=True)]
 

@@ -60,7 +60,7 @@ _TARGETS = _set("target targets des desired ref reference setpoint setp goal sp 
 UNITS: dict[str, float] = {
     "deg": math.pi / 180, "degs": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180,
     "dps": math.pi / 180, "degps": math.pi / 180, "radps": 1.0, "rpm": math.pi / 30, "rad": 1.0, "rads": 1.0,
-    "radian": 1.0, "radians": 1.0, "mm": 1e-3,
+    "radian": 1.0, "radians": 1.0, "mrad": 1e-3, "mm": 1e-3,
     "mmps": 1e-3, "cm": 1e-2, "meter": 1.0, "meters": 1.0, "nm": 1.0, "newton": 1.0, "mnm": 1e-3,
 }  # fmt: skip
 #: Words of hundredths of a range, and of what is so commanded.
@@ -270,6 +270,33 @@ def body_rates(names: Sequence[str], known: Sequence[str] = ()) -> list[str]:
     if all(len(at) == 1 for at in axes.values()) and not axes.keys() & {name.lower() for name in known}:
         for letter, axis in zip("pqr", _AXES, strict=True):
             found[axes[letter][0]] = f"gyro {axis} {_unit_words(names[axes[letter][0]])}".strip()
+    return found
+
+
+def by_family(names: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Return names with a family's first word for another one: ``cam_x``, ``cam_yaw`` for ``sled_x``, ``sled_yaw``.
+
+    Columns are so called where the rest of their names, units apart, is that of all objects of the model that have a
+    first word in common, and no column has that word.
+
+    Args:
+        names: of columns.
+        known: names of the model's objects.
+    """
+    families: dict[str, set[tuple[str, ...]]] = {}
+    for words in {tuple(split(name)) for name in known}:
+        if len(words) > 1:
+            families.setdefault(words[0], set()).add(words[1:])
+    columns: dict[str, dict[tuple[str, ...], int]] = {}
+    for i, name in enumerate(names):
+        if len(words := tuple(_unit(split(name))[0])) > 1:
+            columns.setdefault(words[0], {})[words[1:]] = i
+    found = list(names)
+    for first, rests in families.items():
+        alike = [word for word, own in columns.items() if own.keys() == rests]
+        if len(rests) > 1 and len(alike) == 1 and first not in columns:
+            for i in columns[alike[0]].values():
+                found[i] = " ".join([first, *split(names[i])[1:]])
     return found
 
 
