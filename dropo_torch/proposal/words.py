@@ -277,7 +277,7 @@ def by_family(names: Sequence[str], known: Sequence[str]) -> list[str]:
     """Return names with a family's first word for another one: ``cam_x``, ``cam_yaw`` for ``sled_x``, ``sled_yaw``.
 
     Columns are so called where the rest of their names, units apart, is that of all objects of the model that have a
-    first word in common, and no column has that word.
+    first word in common, and no column has that word; where they are no numbers alone.
 
     Args:
         names: of columns.
@@ -287,9 +287,10 @@ def by_family(names: Sequence[str], known: Sequence[str]) -> list[str]:
     for words in {tuple(split(name)) for name in known}:
         if len(words) > 1:
             families.setdefault(words[0], set()).add(words[1:])
+    families = {first: rests for first, rests in families.items() if all(any(map(str.isalpha, r)) for r in rests)}
     columns: dict[str, dict[tuple[str, ...], int]] = {}
     for i, name in enumerate(names):
-        if len(words := tuple(_unit(split(name))[0])) > 1:
+        if len(words := tuple(_unit(split(name))[0])) > 1 and not _role(words[0]):
             columns.setdefault(words[0], {})[words[1:]] = i
     found = list(names)
     for first, rests in families.items():
