@@ -48,6 +48,8 @@ class JointElasticity(DrivenJointEffect):
     positional = True
     #: What is left of the rotor's state where it is taken for forgotten.
     FORGOTTEN = 0.01
+    #: Share of its compliance to which a step of a fit may stiffen it.
+    SHORTEST = 0.25
     sentence = "the transmission of {target} gives: a spring between its motor and the joint"
 
     @staticmethod
@@ -77,6 +79,18 @@ class JointElasticity(DrivenJointEffect):
         """Return the largest stiffness that a physics step can follow."""
         invweight = setting.model.dof_invweight0[setting.dof(target)]
         return float(STIFFEST**2 / (invweight * setting.model.opt.timestep**2))
+
+    def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Move in the compliance and in its products with damping and inertia, which are what acts.
+
+        Far below the resonance, the link shows these products alone: a spring twice as soft with half of both is nearly
+        the same.
+        """
+        if start[0] <= 0:
+            return values
+        compliance = max(values[0], self.SHORTEST * start[0])
+        products = start[0] * values[1:] + start[1:] * (values[0] - start[0])
+        return np.concatenate([[compliance], np.maximum(products, 0.0) / compliance])
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         if values[0] == 0:
