@@ -194,6 +194,12 @@ def test_a_family_may_be_called_after_what_measures_it() -> None:
         assert by_family(others, joints) == others
 
 
+def test_two_families_of_the_same_words_are_not_confused() -> None:
+    joints = ["left_hip", "left_knee", "right_hip", "right_knee"]
+    for names in (["l_hip", "l_knee", "r_hip", "r_knee"], ["enc_hip", "enc_knee"]):
+        assert by_family(names, joints) == names
+
+
 def test_act_says_what_was_measured_where_nothing_else_does() -> None:
     """Beside a position of the same joint it is the command, as in data sets of imitation."""
 

@@ -293,10 +293,14 @@ def by_family(names: Sequence[str], known: Sequence[str]) -> list[str]:
         if len(words := tuple(_unit(split(name))[0])) > 1 and not _role(words[0]):
             columns.setdefault(words[0], {})[words[1:]] = i
     found = list(names)
-    for first, rests in families.items():
-        alike = [word for word, own in columns.items() if own.keys() == rests]
-        if len(rests) > 1 and len(alike) == 1 and first not in columns:
-            for i in columns[alike[0]].values():
+    pairs = [
+        (first, word) for first, rests in families.items() for word, own in columns.items()
+        if len(rests) > 1 and own.keys() == rests and first not in columns
+    ]  # fmt: skip
+    times = Counter(word for pair in pairs for word in pair)
+    for first, word in pairs:
+        if times[first] == times[word] == 1:  # left and right legs, say, are two families of the same words
+            for i in columns[word].values():
                 found[i] = " ".join([first, *split(names[i])[1:]])
     return found
 
