@@ -152,7 +152,7 @@ def _lead(model: mujoco.MjModel | None, effects: EffectSet | None) -> float:
 
 def _ahead(model: mujoco.MjModel | None, frame_skip: int) -> float:
     """By what share of a transition positions follow later velocities: all integrators but RK4 are semi-implicit."""
-    explicit = model is None or model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    explicit = model is None or velocity_lead(model) == 0
     return 0.0 if explicit else 1 / frame_skip
 
 

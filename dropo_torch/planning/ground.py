@@ -16,6 +16,7 @@ from dropo_torch.data.trajectory import Trajectories, make_transitions, with_uns
 from dropo_torch.distribution import Distribution, to_coordinates
 from dropo_torch.errors import InputError
 from dropo_torch.logged import completed
+from dropo_torch.models.constants import velocity_lead
 from dropo_torch.models.load import load_model
 from dropo_torch.planning.drives import Drive, Tracker, drives_of
 from dropo_torch.planning.information import Information, inefficiency, information_of
@@ -118,8 +119,7 @@ class Ground:
             ends.ravel(), self.timestep, "the planned motion",
         )  # fmt: skip
         skip = self.problem.simulator.frame_skip
-        explicit = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        return with_unseen(log, observation, self.timestep, 0.0 if explicit else 1 / skip)
+        return with_unseen(log, observation, self.timestep, 1 / skip if velocity_lead(self.model) else 0.0)
 
     def told(self, states: np.ndarray, commands: np.ndarray) -> list[Information]:
         """Return what motions ``(P, N + 1, nq + nv)`` tell, from some of their windows."""
