@@ -221,6 +221,26 @@ def test_linear_drag_slows_a_free_body_in_proportion_to_its_speed() -> None:
     assert find_effect("linear_drag").targets(setting_of(general(xml))) == ["drone"]
 
 
+@pytest.mark.parametrize(("name", "speed"), [("linear_drag", 1.0), ("quadratic_drag", 2.0)])
+def test_drag_slows_what_slides_in_a_plane_but_not_what_a_carriage_holds(name: str, speed: float) -> None:
+    slides = '<joint type="slide" axis="0 1 0"/><joint type="slide" axis="{}"/><joint axis="0 0 1"/><geom size=".1"/>'
+    xml = f"""<mujoco><worldbody>
+      <body name="sled">{slides.format("3 0 0")}
+        <body name="rider" pos="0 0 .3">{slides.format("1 0 0")}</body></body>
+      <body name="skew" pos="2 0 0">{slides.format("1 1 0")}</body>
+      <body name="car" pos="4 0 0"><joint type="slide" axis="1 0 0"/><geom size=".1"/></body></worldbody></mujoco>"""
+    plain, effect = general(xml), find_effect(name)
+    assert effect.targets(setting_of(plain)) == ["sled"]
+    model = with_effects(plain, [Placed(effect, "sled", (0.4,))])
+    data = mujoco.MjData(model)
+    data.qvel[:3] = qvel = np.array([1.2, -1.6, 5.0])  # at 2 m/s, and turning
+    mujoco.mj_forward(model, data)
+    own = effect.force(setting_of(plain), "sled", np.array([[0.4]]), data.qpos[None], data.qvel[None])
+    force = data.qfrc_passive + own[0]
+    np.testing.assert_allclose(force[:2], -0.4 * speed * qvel[:2], rtol=1e-9)
+    np.testing.assert_allclose(force[2:], 0, atol=1e-12)
+
+
 def test_axis_drag_is_along_the_axes_of_the_body() -> None:
     xml = """<mujoco><option gravity="0 0 0"/><worldbody><body name="hull"><freejoint/>
       <geom type="box" size=".1 .2 .3" mass="2"/></body></worldbody></mujoco>"""

@@ -1496,6 +1496,14 @@ def test_commands_by_a_clock_of_their_own_are_put_back(tmp_path: Path) -> None:
     found = dropo.propose_config(*written(tmp_path, frame, CLOCKED), out=tmp_path / "robot.yaml")
     assert found.draft.document["data"]["preprocess"]["command_clock"] is True
     assert any("commands change every 0.033 s" in note for note in found.draft.notes)
+    stamps = (pd.Timestamp("2025-03-11") + pd.to_timedelta(frame["time"], unit="s")).dt.strftime(
+        "%Y-%m-%dT%H:%M:%S.%fZ"
+    )
+    dated = dropo.propose_config(
+        *written(tmp_path, frame.assign(time=stamps), CLOCKED), out=tmp_path / "dated.yaml"
+    ).draft.document
+    assert dated["data"]["time"] == "time"
+    assert dated["data"]["preprocess"]["command_clock"] is True
     frame["push_cmd"] = np.repeat(rng.uniform(-1, 1, 200), 3)
     steady = dropo.propose_config(*written(tmp_path, frame, CLOCKED), out=tmp_path / "steady.yaml")
     assert "command_clock" not in steady.draft.document["data"].get("preprocess", {})
@@ -1503,6 +1511,24 @@ def test_commands_by_a_clock_of_their_own_are_put_back(tmp_path: Path) -> None:
 
 CLOCKED = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="slide" type="slide" axis="1 0 0"/>
   <geom size=".1"/></body></worldbody><actuator><motor name="push" joint="slide" gear="5"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("comment", ["# of 3 May\n# {}\n", "% {}\n", "// of 3 May, at noon\n{}\n"])
+def test_blanks_may_separate_columns_that_a_comment_names(comment: str, tmp_path: Path) -> None:
+    t = np.arange(400) * 0.01
+    data, model = mujoco.MjData(compiled := mujoco.MjModel.from_xml_string(CLOCKED)), tmp_path / "robot.xml"
+    rows = []
+    for i in t:
+        data.ctrl[0] = np.sin(7 * i)
+        rows.append([i, *data.qpos, *data.qvel, *data.ctrl])
+        mujoco.mj_step(compiled, data, 10)
+    model.write_text(CLOCKED)
+    with (tmp_path / "log.txt").open("w") as file:
+        file.write(comment.format("time  slide_pos slide_vel   push_cmd"))
+        np.savetxt(file, rows, fmt="%.9g")
+    found = dropo.propose_config(model, tmp_path / "log.txt", out=tmp_path / "robot.yaml").draft
+    assert found.document["data"]["separator"] == " "
+    np.testing.assert_allclose(found.logged.trajectories.observations, np.array(rows)[:-1, 1:3], rtol=1e-8)
 
 
 def test_columns_of_decimal_commas_are_told_as_text(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -87,6 +87,19 @@ def write_spaced_csv(folder: Path):
     return folder / "log.txt", {**COLUMNS, "separator": ";"}
 
 
+def write_savetxt(folder: Path):
+    table = frame()
+    header = "of an arm, 3 May\n" + " ".join(table)
+    np.savetxt(folder / "log.txt", table.to_numpy(dtype=float), header=header, fmt="%.17g")
+    return folder / "log.txt", {**COLUMNS, "separator": " "}
+
+
+def write_commented_csv(folder: Path):
+    frame().to_csv(folder / "log.csv", index=False)
+    (folder / "log.csv").write_text("% exported\n" + (folder / "log.csv").read_text())
+    return folder / "log.csv", COLUMNS
+
+
 def write_dated_csv(folder: Path):
     stamps = pd.Timestamp("2024-05-01 12:00") + pd.to_timedelta(TIME, unit="s")
     frame(t=stamps.strftime("%Y-%m-%dT%H:%M:%S.%f")).to_csv(folder / "log.csv", index=False)

@@ -39,7 +39,7 @@ from dropo_torch.data.tables import Table
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.child import read_in_child
 from dropo_torch.support.extras import extra
-from dropo_torch.support.given import check_size, reading
+from dropo_torch.support.given import MOST_TEXT, check_size, reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 _DECIMAL_COMMA = r"[-+]?\d*(,\d*)?([eE][-+]?\d+)?"
 _THOUSANDS = r"[-+]?(0|[1-9]\d{0,2}(,\d{3})*)"
 
+#: How lines begin that are comments.
+_COMMENTS = ("#", "%", "//")
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -86,18 +88,29 @@ def open_npy(path: Path, _: str | None) -> list[Table]:
 
 
 def open_text(path: Path, separator: str | None) -> list[Table]:
-    """Text in columns, the first row naming them."""
+    """Text in columns, the first row naming them, or the last line of a comment above them."""
     with extra("formats", str(path)):
         import pandas as pd
     separator = separator or ("\t" if path.suffix.lower() == ".tsv" else ",")
+    skipped, comment = comment_above(path)
     with (
         reading(path, "a table of text"),
         warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
     ):
         read: Callable[..., Any] = partial(
-            pd.read_csv, path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False
-        )
-        head = read(header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
+            pd.read_csv, sep=r"\s+" if separator == " " else separator, skipinitialspace=True, index_col=False,
+            low_memory=False,
+        )  # fmt: skip
+        first = partial(read, header=None, nrows=1, dtype=str, keep_default_na=False)
+        read, head = partial(read, path, skiprows=skipped), first(path, skiprows=skipped).iloc[0]
+        if comment and any(map(_is_number, head)):
+            read, width = partial(read, header=None), len(head)
+            head = first(io.StringIO(comment)).iloc[0]
+            if len(head) != width:
+                raise InputError(
+                    f"{path}: the comment above the rows has {len(head)} names and they have {width} columns; "
+                    "expected a name for each"
+                )
         frame = read()
         if separator != "," and _has_decimal_commas(frame):
             frame = read(decimal=",")
@@ -112,10 +125,27 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
                 f"{path}: {name} has a line break at row {rows[0]} (counted from 0); is a quotation mark left open?"
             )
     only = str(frame.columns[0])
-    other = next((mark for mark in ";\t," if mark != separator and mark in only), None)
+    other = next((mark for mark in ";\t, " if mark != separator and mark in only), None)
     if len(frame.columns) == 1 and other is not None:
         raise InputError(f"{path}: its one column is {only!r}; separator: {other!r} may be what is meant")
     return [frame_table(str(path), frame)]
+
+
+def comment_above(path: Path) -> tuple[int, str | None]:
+    """Return how many lines at the top of a text file are comments, and what the last of them says, if any."""
+    said, count = None, 0
+    with path.open("rb") as file:
+        while (line := file.readline(MOST_TEXT).decode("utf-8-sig", errors="replace").strip()).startswith(_COMMENTS):
+            said, count = line.lstrip("".join(_COMMENTS)).strip(), count + 1
+    return count, said
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 def _has_decimal_commas(frame: pd.DataFrame) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import ClassVar
 
 import mujoco
@@ -225,22 +226,37 @@ class FluidDrag(BodyEffect):
         model.geom_fluid[geom, 1] = values[0] / (area * self.DENSITY)
 
 
-class FreeBodyEffect(BodyEffect):
-    """An effect of what moves freely."""
+class FloatingEffect(BodyEffect):
+    """An effect of what no carriage holds: a free body, or one that slides in a plane or in space on its own joints."""
 
     turning = False
 
     def targets(self, setting: Setting) -> list[str | None]:
-        free = [j for j in range(setting.model.njnt) if setting.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
-        names, bodies = setting.names("body"), setting.model.jnt_bodyid[free]
-        floating = {names[b] for b in bodies}
-        return [t for t in super().targets(setting) if t in floating]
+        return [t for t in super().targets(setting) if len(self.moving(setting.model, t))]
+
+    @staticmethod
+    def moving(model: mujoco.MjModel, target: str | None) -> np.ndarray:
+        """Return the degrees of freedom of a body's frame: three, two in a plane, or none of a body that is held.
+
+        The velocities along them are those of the frame along axes at right angles.
+        """
+        body = body_number(model, target)
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        kinds = model.jnt_type[first : first + count].tolist()
+        begin = int(model.body_dofadr[body])
+        if kinds[:1] == [mujoco.mjtJoint.mjJNT_FREE]:
+            return np.arange(begin, begin + 3)
+        slides = sum(1 for _ in itertools.takewhile(lambda kind: kind == mujoco.mjtJoint.mjJNT_SLIDE, kinds))
+        axes = model.jnt_axis[first : first + slides]
+        held = slides < 2 or model.body_weldid[model.body_parentid[body]] != 0
+        is_skew = not np.allclose(axes @ axes.T, np.eye(slides), atol=1e-6)
+        return np.arange(0 if held or is_skew else slides) + begin
 
 
-class LinearDrag(FreeBodyEffect):
-    """Drag of air or water on a free body, in proportion to its speed: of what is slow, small, or driven by rotors.
+class LinearDrag(FloatingEffect):
+    """Drag of air or water in proportion to the speed of a floating body: of what is slow, small, or driven by rotors.
 
-    It is damping of the three degrees of freedom in which the body's frame moves.
+    It is damping of the degrees of freedom in which the body's frame moves.
     """
 
     name = "linear_drag"
@@ -249,18 +265,16 @@ class LinearDrag(FreeBodyEffect):
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         m, body = setting.model, body_number(setting.model, target)
         scale = float(m.body_subtreemass[body]) / float(setting.signals.linear_speed[body])
-        own = float(self._damping(m, target).min())
+        own = float(self._damping(m)[self.moving(m, target)].min())
         return (Quantity("coefficient", "N·s/m", 0.0, -own, 100 * scale, scale),)
 
     @staticmethod
-    def _damping(model: mujoco.MjModel, target: str | None) -> np.ndarray:
-        """The damping of the degrees of freedom in which a body's frame moves, ``(3,)``, a view."""
-        first = int(model.body_dofadr[body_number(model, target)])
-        damping = np.reshape(model.dof_damping, (model.nv, -1))
-        return np.asarray(damping[first : first + 3, 0])
+    def _damping(model: mujoco.MjModel) -> np.ndarray:
+        """The damping of each degree of freedom ``(nv,)``, a view."""
+        return np.asarray(np.reshape(model.dof_damping, (model.nv, -1))[:, 0])
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        self._damping(model, target)[:] += values[0]
+        self._damping(model)[self.moving(model, target)] += values[0]
 
     @property
     def in_mjcf(self) -> bool:
@@ -268,8 +282,11 @@ class LinearDrag(FreeBodyEffect):
         return False
 
 
-class QuadraticDrag(FreeBodyEffect):
-    """Drag on a free body with the square of its speed, alike in all directions: −coefficient·|v|·v on its frame."""
+class QuadraticDrag(FloatingEffect):
+    """Drag on a floating body with the square of its speed, alike in all directions: −coefficient·|v|·v of its frame.
+
+    Nothing of it turns the body.
+    """
 
     name = "quadratic_drag"
     known_as = FluidDrag.name
@@ -281,13 +298,13 @@ class QuadraticDrag(FreeBodyEffect):
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
-        first = int(setting.model.body_dofadr[body_number(setting.model, target)])
-        moving, out = velocity[:, first : first + 3], np.zeros_like(velocity)
-        out[:, first : first + 3] = -values[..., :1] * np.linalg.norm(moving, axis=1, keepdims=True) * moving
+        own, out = self.moving(setting.model, target), np.zeros_like(velocity)
+        along = velocity[:, own]
+        out[:, own] = -values[..., :1] * np.linalg.norm(along, axis=1, keepdims=True) * along
         return out
 
 
-class AxisDrag(FreeBodyEffect):
+class AxisDrag(FloatingEffect):
     """Drag on a free body with the square of its speed along each axis of its frame, as a hull or a wing has it.
 
     Along each axis it is −coefficient·|v|·v of the velocity along that axis (Fossen 2011, eq. 6.72, its diagonal).
@@ -296,6 +313,11 @@ class AxisDrag(FreeBodyEffect):
     name = "axis_drag"
     known_as = FluidDrag.name
     sentence = "drag of air or water on {target}, with the square of its speed along each of its axes"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m = setting.model
+        free = {b for b in range(m.nbody) if m.body_dofnum[b] == 6 and m.body_jntnum[b] == 1}
+        return [t for t in super().targets(setting) if body_number(m, t) in free]
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         (one,) = FluidDrag().quantities(setting, target)

@@ -65,6 +65,11 @@ class Clock:
         return self.summed or ((self.column,) if self.column is not None else ())
 
     @property
+    def seconds(self) -> np.ndarray | None:
+        """When the rows were taken, dates too, ``(N,)``; ``None`` without stamps."""
+        return None if self.column is None else _stamps(self.column) * self.unit
+
+    @property
     def entry(self) -> str | dict[str, Any] | list[str | dict[str, Any]]:
         """The entry ``time`` of a config, in seconds."""
         *whole, last = self.columns

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.data.bags import unstamped
-from dropo_torch.data.formats import open_tables
+from dropo_torch.data.formats import comment_above, open_tables
 from dropo_torch.data.readers import matching_paths
 from dropo_torch.data.streams import TIME
 from dropo_torch.data.tables import Choice, Table, missing, numbers
@@ -217,12 +217,19 @@ def _interpolated(column: Column, time: np.ndarray, at: np.ndarray) -> Column:
 
 
 def _separator(path: Path) -> str | None:
-    """What separates the columns of a text file, where its header has no comma; ``None`` for what readers expect."""
+    """What separates the columns of a text file whose header has no comma: a mark, blanks, or ``None`` for neither."""
     if path.suffix.lower() not in (".csv", ".txt") or not path.is_file():
         return None
+    skipped, comment = comment_above(path)
     with path.open("rb") as file:
-        header = file.readline(MOST_TEXT).decode("utf-8-sig", errors="replace")
-    return next((mark for mark in (";", "\t") if mark in header and "," not in header), None)
+        lines = [file.readline(MOST_TEXT).decode("utf-8-sig", errors="replace") for _ in range(skipped + 2)]
+    first, second = lines[skipped:]
+    if comment and len(comment.split()) == len(first.split()):
+        first, second = comment, first
+    if "," in first:
+        return None
+    blanks = len(first.split()) == len(second.split()) > 1
+    return next((mark for mark in (";", "\t") if mark in first), " " if blanks else None)
 
 
 def _of_table(table: Table) -> list[Column]:

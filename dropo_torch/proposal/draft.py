@@ -320,10 +320,10 @@ def _preprocess(
 
 def _own_period(columns: Columns, matching: Matching, clock: Clock) -> float | None:
     """Seconds from one command to the next by a controller's own clock, if all episodes show that."""
-    commands = matching.of("command")
-    if clock.column is None or not commands or columns.apart:
+    commands, time = matching.of("command"), clock.seconds
+    if time is None or not commands or columns.apart:
         return None
-    values, time = np.stack([m.values for m in commands], 1), clock.column.values * clock.unit
+    values = np.stack([m.values for m in commands], 1)
     starts = np.append(np.flatnonzero(clock.starts(len(columns), columns.parts)), len(columns))
     parts = [slice(a, b) for a, b in pairwise(starts)]
     if np.isnan(values).any() or not np.isfinite(time).all():
@@ -335,10 +335,11 @@ def _own_period(columns: Columns, matching: Matching, clock: Clock) -> float | N
 def _longest(clock: Clock, rows: int, parts: Sequence[int], matches: Sequence[Match] = ()) -> float:
     """Longest time between rows inside episodes, or between values of columns, seconds."""
     own = max((_longest_hole(m, clock.starts(rows, parts)) for m in matches), default=1) * (clock.dt or 0.0)
-    if clock.column is None or not clock.column.values.size:
+    stamps = clock.seconds
+    if stamps is None:
         return max(own, clock.dt or 0.0)
-    spacing = np.diff(clock.column.values)[~clock.starts(rows, parts)[1:]]
-    return max(own, float(spacing.max(initial=0.0)) * clock.unit)
+    spacing = np.diff(stamps)[~clock.starts(rows, parts)[1:]]
+    return max(own, float(spacing.max(initial=0.0)))
 
 
 def _longest_hole(match: Match, starts: np.ndarray) -> int:
