@@ -1,22 +1,30 @@
-"""A transmission that gives, and friction under load, hidden by other code, are found with their numbers."""
+"""What gives, in a transmission or before it slides, and friction under load, are found with their numbers."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 from test_gap import load, search
 
 from benchmarks.hidden.systems import CART_POLE
 from benchmarks.hidden.truths import Effect, simulate_truth
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import Placed, find_effect
+from dropo_torch.effects.drive import Drive, Drives
 from dropo_torch.effects.engine import Variant
+from dropo_torch.effects.placing import plain_setting
+from dropo_torch.effects.presliding import PAST
 from dropo_torch.gap import prepare
 
 GIVES = {"compliance": 1 / 300, "damping": 3.0, "inertia": 0.5}
 #: Episodes in which what a rotor was before is forgotten long before their middle.
 LONG = {"episodes": 2, "transitions": 400}
+#: Friction of all kinds.
+DRY = ("joint_presliding", "joint_friction", "joint_soft_friction", "joint_stribeck", "joint_damping", "armature")
+SWING = """<mujoco><worldbody><body><joint name="hinge"/><geom size=".1" pos=".3 0 0"/></body></worldbody></mujoco>"""
 KNOWN = ("joint_elasticity", "joint_load_friction", "joint_friction", "joint_damping", "armature", "actuator_lag")
 
 
@@ -31,6 +39,35 @@ def test_what_depends_on_the_drive_is_found(effect: str, numbers: dict[str, floa
     low, high = strength.low, strength.high
     assert low <= numbers[first] <= high
     assert high - low < 0.5 * numbers[first]
+
+
+@pytest.mark.parametrize(("joint", "coulomb"), [("hinge", 0.2), ("rail", 1.5)])
+@pytest.mark.parametrize("displacement", [0.003, 0.1])
+def test_dry_friction_that_gives_is_told_from_other_friction(joint: str, coulomb: float, displacement: float) -> None:
+    truth = Effect("joint_presliding", joint, {"coulomb": coulomb, "displacement": displacement})
+    gap = search(simulate_truth(CART_POLE, [truth], 3, episodes=4, transitions=100), DRY)
+    assert [(e.effect, e.target) for e in gap.effects] == [("joint_presliding", joint)]
+    found = gap.effects[0].parameters
+    assert found["coulomb"].value == pytest.approx(coulomb, rel=0.01)
+    assert found["displacement"].value == pytest.approx(displacement, rel=0.05)
+    assert gap.reduced[1] < 1.1
+
+
+def test_bristles_follow_the_motion_before_a_simulation() -> None:
+    """Once a joint has turned, its friction is not what its velocity alone tells."""
+    placed = Placed(find_effect("joint_presliding"), "hinge", (0.2, 0.1))
+    model = mujoco.MjModel.from_xml_string(SWING)
+    setting, dt = plain_setting(model, parse_observation(model, None), 1), 0.01
+    speed = np.concatenate([np.full(40, -1.0), np.full(5, 0.4)])[None, :, None]
+    angle = np.concatenate([[0.0], np.cumsum(0.5 * dt * (speed[0, 1:, 0] + speed[0, :-1, 0]))])[None, :, None]
+    drive = Drive(Drives.of([model]), np.zeros((1, 44, 0)), dt)
+    ((bristle, at),) = placed.effect.replay(setting, "hinge", np.array([placed.values]), angle, speed, drive)
+    before = -1 + np.exp(-(PAST + (39 + 0.3) * dt) / 0.1)  # at the mean of both speeds where it turns
+    assert at == angle[0, -1, 0]
+    assert bristle == pytest.approx(1 + (before - 1) * np.exp(-4 * 0.4 * dt / 0.1))
+    speed[0, :42] = np.nan  # an episode that begins there: as if the joint had moved so before
+    ((begun, _),) = placed.effect.replay(setting, "hinge", np.array([placed.values]), angle, speed, drive)
+    assert begun == pytest.approx(1 - np.exp(-0.4 * (PAST + 2 * dt) / 0.1))
 
 
 def test_a_rotor_goes_on_from_the_rows_before() -> None:

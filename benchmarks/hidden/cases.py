@@ -57,6 +57,7 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     "joint_quadratic_damping": _JOINTS,
     "joint_friction": _JOINTS,
     "joint_stribeck": _JOINTS,
+    "joint_presliding": _JOINTS,
     "joint_load_friction": {"torque_arm": _ARM, "servo_arm": _SERVO[:2], "cart_pole": ("rail",), "furuta": ("turn",)},
     "joint_elasticity": {"torque_arm": _ARM, "servo_arm": _SERVO[:2], "cart_pole": ("rail",), "furuta": ("turn",)},
     "joint_stiffness": {**_JOINTS, "hopper": _LEG},
@@ -104,13 +105,12 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     "contact_margin": _CONTACTS,
     "torque_ripple": {"torque_arm": _ARM, "furuta": _FURUTA, "puck": ("root",)},
     "uneven_friction": {"servo_arm": ("elbow",), "furuta": ("turn",), "cart_pole": ("rail",)},
-    "hysteresis": {"torque_arm": ("elbow", "shoulder"), "cart_pole": ("hinge",)},
     "far_spring": {"torque_arm": ("fore",), "servo_arm": ("fore",)},
     "slosh": {"torque_arm": ("fore",), "cart_pole": ("pole",), "servo_arm": ("hand",)},
     "dropout": {"torque_arm": _ACTUATORS["torque_arm"], "cart_pole": ("push",)},
     "gain_drift": {"torque_arm": _ACTUATORS["torque_arm"], "furuta": ("drive",)},
 }  # fmt: skip
-OUTSIDE = ("torque_ripple", "uneven_friction", "hysteresis", "far_spring", "slosh", "dropout", "gain_drift")
+OUTSIDE = ("torque_ripple", "uneven_friction", "far_spring", "slosh", "dropout", "gain_drift")
 VOCABULARY = tuple(e for e in OPTIONS if e not in OUTSIDE)
 #: Pairs of effects: system, and what hides in it.
 DOUBLES = (
@@ -425,6 +425,11 @@ def _stribeck(t: float, v: float, _i: float, rng: np.random.Generator) -> Draw:
     return lambda s: {"coulomb": 0.3 * s * t, "static": 0.3 * s * t * ratio, "velocity": knee}
 
 
+def _presliding(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
+    displacement = 10 ** rng.uniform(-2.5, -1.0)
+    return lambda s: {"coulomb": 0.5 * s * t, "displacement": displacement}
+
+
 def _cogging(t: float, v: float, _i: float, rng: np.random.Generator) -> Draw:
     poles, phase = int(rng.integers(4, 15)), rng.uniform(-np.pi, np.pi)
     return lambda s: {"amplitude": 0.5 * s * t, "poles": poles, "phase": phase}
@@ -561,11 +566,6 @@ def _uneven(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
     return lambda s: {"friction": 0.3 * s * t, "waves": waves, "phase": phase}
 
 
-def _hysteresis(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
-    width = rng.uniform(0.05, 0.2)
-    return lambda s: {"stiffness": 0.5 * s * t / width, "yield": width}
-
-
 def _far_spring(system: System, target: str | None, rng: np.random.Generator) -> Draw:
     x, y, z = (rng.uniform(-0.5, 0.5, 3) + np.array([0.3, 0.0, 1.0])).tolist()
     weight, rest = 9.81 * _body_mass(system, target), rng.uniform(0.1, 0.3)
@@ -597,6 +597,7 @@ DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
     "joint_quadratic_damping": _joint_draw(lambda t, v, i, r: lambda s: {"coefficient": s * t / v**2}),
     "joint_friction": _joint_draw(lambda t, v, i, r: lambda s: {"friction": 0.4 * s * t}),
     "joint_stribeck": _joint_draw(_stribeck),
+    "joint_presliding": _joint_draw(_presliding),
     "joint_load_friction": _joint_draw(lambda t, v, i, r: lambda s: {"coefficient": 0.6 * s}),
     "joint_elasticity": _joint_draw(_elasticity),
     "joint_stiffness": _joint_draw(_stiffness),
@@ -629,7 +630,6 @@ DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
     "contact_margin": _contact_margin,
     "torque_ripple": _joint_draw(_ripple),
     "uneven_friction": _joint_draw(_uneven),
-    "hysteresis": _joint_draw(_hysteresis),
     "far_spring": _far_spring,
     "slosh": _slosh,
     "dropout": _actuator_draw(_dropout),

@@ -310,6 +310,24 @@ def _elasticity(plant: Plant, joint: str, stiffness: float, damping: float, iner
     return force
 
 
+def _presliding(plant: Plant, joint: str, coulomb: float, displacement: float) -> Force:
+    """Dahl's friction: a spring that yields, and remembers."""
+    i = plant.dof(joint)
+    memory = {"z": 0.0}
+
+    def forget() -> None:
+        memory["z"] = 0.0
+
+    def force(p: Plant) -> None:
+        v, z = float(p.middle_v[i]), memory["z"]
+        toward, share = math.copysign(1.0, v), math.exp(-abs(v) * p.h / displacement)
+        memory["z"] = toward + (z - toward) * share
+        p.force[i] -= 0.5 * coulomb * (z + memory["z"])
+
+    plant.memories.append(forget)
+    return force
+
+
 def _stribeck_level(coulomb: float, static: float, velocity: float) -> Callable[[float, float], float]:
     return lambda _q, speed: coulomb + (static - coulomb) * math.exp(-((speed / velocity) ** 2))
 
@@ -325,6 +343,7 @@ JOINT_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = {
     "joint_friction": lambda p, j, x: _dry_friction(p, j, lambda _q, _v: x["friction"]),
     "joint_stribeck": lambda p, j, x: _dry_friction(p, j, _stribeck_level(x["coulomb"], x["static"], x["velocity"])),
     "joint_load_friction": lambda p, j, x: _load_friction(p, j, x["coefficient"]),
+    "joint_presliding": lambda p, j, x: _presliding(p, j, x["coulomb"], x["displacement"]),
     "joint_elasticity": lambda p, j, x: _elasticity(p, j, 1 / x["compliance"], x["damping"], x["inertia"]),
     "joint_coupling": lambda p, j, x: _coupling(p, j, x["stiffness"]),
 }
@@ -509,23 +528,6 @@ def _uneven_friction(plant: Plant, joint: str, x: Mapping[str, float]) -> Force:
     return _dry_friction(plant, joint, lambda q, _v: x["friction"] * (1 + math.sin(x["waves"] * q + x["phase"])))
 
 
-def _hysteresis(plant: Plant, joint: str, x: Mapping[str, float]) -> Force:
-    """Bouc and Wen's hysteretic torque: a spring that yields, and remembers."""
-    i = plant.dof(joint)
-    memory = {"z": 0.0}
-
-    def forget() -> None:
-        memory["z"] = 0.0
-
-    def force(p: Plant) -> None:
-        v, z = float(p.middle_v[i]), memory["z"]
-        memory["z"] = z + p.h * (v - abs(v) * z / x["yield"])
-        p.force[i] -= x["stiffness"] * 0.5 * (z + memory["z"])
-
-    plant.memories.append(forget)
-    return force
-
-
 def _far_spring(plant: Plant, body: str, x: Mapping[str, float]) -> Force:
     """A spring from a point of a body to a point fixed in the world."""
     number = plant.model.body(body).id
@@ -544,7 +546,6 @@ def _far_spring(plant: Plant, body: str, x: Mapping[str, float]) -> Force:
 #: Forces outside the vocabulary: (plant, target, parameters) → force.
 OUTSIDE_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = {
     "torque_ripple": _ripple,
-    "hysteresis": _hysteresis,
     "far_spring": _far_spring,
 }
 

@@ -112,7 +112,7 @@ def remembered_from(lengths: np.ndarray, rows: int) -> np.ndarray:
 
 def drives_of(forces: Iterable[Force], models: Models, each: int = 1) -> Drives | None:
     """Return the laws of the actuators of models, each in ``each`` rows; ``None`` where no force depends on them."""
-    if not any(f.effect.has("force_under") for f in forces):
+    if not any(f.effect.has(method) for f in forces for method in ("force_under", "replay")):
         return None
     return Drives.of([m for m in models if m is not None], each)
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from dropo_torch.effects.base import Quantity, Setting
+from dropo_torch.effects.base import Placed, Quantity, Setting
+from dropo_torch.effects.drive import Drive
 from dropo_torch.effects.joint import JointEffect, unit
 
-#: Seconds for which a joint has moved with the velocity that it has where a simulation begins.
+#: Seconds for which a joint has moved with the velocity that it has where nothing tells what was before.
 PAST = 0.1
+#: Seconds before a simulation from which the bristles are replayed.
+REPLAYED = 0.5
 #: Highest frequency at which the bristles may let the joint oscillate, in radians of a physics step.
 STIFFEST = 0.5
 
@@ -30,12 +33,12 @@ class JointPresliding(JointEffect):
 
     The friction is ``coulomb·z``. The deflection z of the bristles, -1 to 1, follows a small motion dq by
     ``(dq - |dq|·z)/displacement``: at rest it is a spring of ``coulomb/displacement``, at most as stiff as a physics
-    step can hold. A simulation begins as if the joint had moved for a tenth of a second at the velocity that it has.
+    step can hold. The bristles follow the motion before a simulation where it is known; elsewhere it begins as if the
+    joint had moved for a tenth of a second at the velocity that it has.
     """
 
     name = "joint_presliding"
-    alone = False
-    contains = ("joint_friction",)
+    contains = ("joint_friction", "joint_soft_friction", "joint_stribeck")
     sentence = "dry friction in {target} that gives elastically before it slides (presliding)"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
@@ -49,7 +52,17 @@ class JointPresliding(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         force, displacement = self.quantities(setting, target)
-        return [np.array([0.2 * force.scale, displacement.neutral])]
+        return [np.array([0.2 * force.scale, far * displacement.neutral]) for far in (1.0, 10.0)]
+
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        if simpler.effect.name not in self.contains or simpler.values[0] <= 0:
+            return []
+        return [np.array([simpler.values[0], self.quantities(setting, simpler.target)[1].neutral])]
+
+    def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Shorten the displacement by its factor, not by its difference: no step takes it to nothing at once."""
+        shorter = values[1] < start[1]
+        return np.array([values[0], start[1] * np.exp(values[1] / start[1] - 1)]) if shorter else values
 
     @staticmethod
     def softened(setting: Setting, target: str | None, values: np.ndarray) -> np.ndarray:
@@ -64,6 +77,26 @@ class JointPresliding(JointEffect):
         moved = PAST * velocity[:, setting.dof(target)]
         bristle = bristle_after(np.zeros_like(moved), moved, self.softened(setting, target, values))
         return np.stack([bristle, position[:, setting.coordinate(target)]], 1)
+
+    def memory(self, values: np.ndarray) -> float:
+        return REPLAYED
+
+    def replay(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
+        drive: Drive,
+    ) -> np.ndarray:  # fmt: skip
+        """Return :meth:`recall` after the motion before: its velocities tell small ones better than its positions."""
+        recalled = self.recall(setting, target, values, position[:, -1], velocity[:, -1])
+        displacement, speed = self.softened(setting, target, values), velocity[..., setting.dof(target)]
+        seen, speed = np.isfinite(speed[:, :-1]), np.nan_to_num(speed)
+        bristle, known = recalled[:, 0], np.zeros(len(seen), dtype=bool)
+        for row in range(seen.shape[1]):
+            here = seen[:, row]
+            begin = bristle_after(np.zeros(len(seen)), PAST * speed[:, row], displacement)
+            bristle, known = np.where(here & ~known, begin, bristle), known | here
+            moved = 0.5 * drive.step * (speed[:, row] + speed[:, row + 1])
+            bristle = np.where(here, bristle_after(bristle, moved, displacement), bristle)
+        return np.stack([bristle, recalled[:, 1]], 1)
 
     def force_after(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
