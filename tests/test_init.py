@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 import yaml
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 import dropo_torch as dropo
 from benchmarks.init.systems import ROBOTS
@@ -27,6 +28,7 @@ from dropo_torch.gap.given import as_given
 from dropo_torch.models.load import load_model
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.proposal import propose
+from dropo_torch.proposal.angles import Angles, find_angles
 from dropo_torch.proposal.candidates import Candidate, decides
 from dropo_torch.proposal.choice import choose
 from dropo_torch.proposal.clock import find_clock
@@ -113,6 +115,7 @@ def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, nam
         ("t_ms", "time", None, ("ms",), ()),
         ("run", "episode", None, (), ()),
         ("motor_temp_2", "other", None, (), (2,)),
+        ("cmd_v_fr_N", "command", 1.0, ("v", "fr"), ()),
         ("elbow_acceleration", "acceleration", None, ("elbow",), ()),
         ("J2_spd(rpm)", "velocity", math.pi / 30, ("j",), (2,)),
         ("current_position_3", "position", None, (), (3,)),
@@ -1000,6 +1003,130 @@ def test_the_only_pose_is_that_of_the_only_free_body_and_a_gyroscope_turns_as_it
     assert columns["flap.velocity"].std() == pytest.approx(table[:, 9].std(), rel=0.05)
 
 
+FLOATING = """<mujoco>
+  <option timestep=".002" gravity="0 0 0" integrator="RK4"/>
+  <worldbody><body name="hull">
+    <freejoint name="hull_free"/><geom type="box" size=".2 .1 .05" mass="2"/><site name="bow" pos=".1 .05 0"/>
+  </body></worldbody>
+  <actuator>
+    <motor name="surge" site="bow" gear="1 0 0 0 0 0"/><motor name="turn" site="bow" gear="0 0 0 .02 .05 .1"/>
+  </actuator>
+</mujoco>"""
+
+
+def floated(seconds: float = 6.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A hull that turns over, exactly: times, positions, velocities, commands."""
+    start, rng = [0, 0, 0, 1, 0, 0, 0], np.random.default_rng(0)
+    phases = rng.uniform(0, 6, 2)
+    t, q, v, u = recorded(
+        mujoco.MjModel.from_xml_string(FLOATING), seconds, 5,
+        lambda t: (np.sin(3 * t + phases) + 0.5).tolist(), start=start, noise=(0.0, 0.0),
+    )  # fmt: skip
+    q[:, :3] += 1e-3 * rng.standard_normal((len(q), 3))
+    return t, q, v, u
+
+
+def rolled_pitched_yawed(names: Sequence[str], unit: float = 1.0, sequence: str = "xyz") -> dict[str, np.ndarray]:
+    """The log of such a hull with its orientation as angles of these names, with some noise."""
+    t, q, v, u = floated()
+    angles = Rotation.from_quat(q[:, 3:], scalar_first=True).as_euler(sequence) / unit
+    angles += 1e-3 / unit * np.random.default_rng(1).standard_normal(angles.shape)
+    frame = {"t": t} | dict(zip(("x_m", "y_m", "z_m", *names), np.hstack([q[:, :3], angles]).T, strict=True))
+    gyro = DEG * (v[:, 3:] + 3e-3 * np.random.default_rng(2).standard_normal((len(t), 3)))
+    frame |= {f"gyro_{axis}_dps": gyro[:, i] for i, axis in enumerate("xyz")}
+    return frame | {"surge_cmd": u[:, 0], "turn_cmd": u[:, 1]}
+
+
+@pytest.mark.parametrize(
+    ("names", "unit", "name", "told"),
+    [
+        (("roll_deg", "pitch_deg", "yaw_deg"), 1 / DEG, "orientation", "degrees"),
+        (("Roll", "Pitch", "Yaw"), 1 / DEG, "orientation", "degrees"),
+        (("att.roll", "att.pitch", "att.yaw"), 1.0, "orientation", "rad"),
+        (("hull_phi", "hull_theta", "hull_psi"), 1.0, "hull", "rad"),
+        (("imu_roll_mrad", "imu_pitch_mrad", "imu_yaw_mrad"), 1e-3, "imu", "mrad"),
+    ],
+)
+def test_roll_pitch_and_yaw_are_the_orientation_of_a_free_body(
+    names: tuple[str, str, str], unit: float, name: str, told: str, tmp_path: Path
+) -> None:
+    files = written(tmp_path, rolled_pitched_yawed(names, unit), FLOATING)
+    found = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
+    label = {m.column.entry: m.place.label for m in found.matching.matches}
+    assert [label[f"{name}[{axis}]"] for axis in "wxyz"] == [f"hull_free.position[q{axis}]" for axis in "wxyz"]
+    assert label["gyro_y_dps"] == "hull_free.velocity[wy]"
+    angles = [{"signal": n, "scale": pytest.approx(unit)} if unit != 1 else n for n in names]
+    assert found.document["data"]["orientations"] == {name: {"angles": angles, "sequence": "xyz"}}
+    said = f"{', '.join(names)} are hull's orientation: roll, pitch, yaw in {told} about the fixed axes x, y, z"
+    assert said in " ".join(found.text.replace("\n# ", " ").split())
+    assert found.draft.turned == (said,)
+    assert not any("not used" in note for note in found.draft.notes)
+    assert found.config == dropo.make_config(yaml.safe_load(found.text), base=tmp_path)
+    log = dropo.make_problem(found.config).trajectories
+    read = {label: log.observations[:, i] for i, label in enumerate(found.labels)}
+    quaternion = np.stack([read[f"hull_free.position[q{axis}]"] for axis in "wxyz"], axis=1)
+    t, q, v, _ = floated()
+    near = [int(np.abs(v[:, 3:] - row).sum(axis=1).argmin()) for row in rates_of(read)]
+    wrong = Rotation.from_quat(quaternion, scalar_first=True) * Rotation.from_quat(q[near, 3:], scalar_first=True).inv()
+    assert len(near) > 0.8 * len(t)
+    assert np.median(wrong.magnitude()) < 0.02
+
+
+def rates_of(read: dict[str, np.ndarray]) -> np.ndarray:
+    return np.stack([read[f"hull_free.velocity[w{axis}]"] for axis in "xyz"], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "told"),
+    [
+        ("xyz", "the fixed axes x, y, z"),
+        ("XYZ", "axes that turn with it, x, y, z"),
+        ("zyx", "the fixed axes z, y, x"),
+        ("ZYX", "axes that turn with it, z, y, x"),
+    ],
+)
+def test_a_gyroscope_tells_the_sequence_of_angles(sequence: str, told: str, tmp_path: Path) -> None:
+    """Angles without one are roll, pitch and yaw as everybody's are; of others the config says why."""
+    frame = rolled_pitched_yawed(("roll_deg", "pitch_deg", "yaw_deg"), 1 / DEG, sequence)
+    files = written(tmp_path, frame, FLOATING)
+    found = read_turned(files)
+    assert found[0].sequence == sequence
+    assert told in found[0].said_of("hull")
+    assert ("as the gyroscope shows" in found[0].said_of("hull")) == (sequence != "xyz")
+    for axis in "xyz":
+        del frame[f"gyro_{axis}_dps"]
+    assert read_turned(written(tmp_path, frame, FLOATING))[0].sequence == "xyz"
+
+
+def read_turned(files: Sequence[str]) -> tuple[Angles, ...]:
+    """The angles in a log that may be orientations of a model."""
+    model = load_model(Path(files[0]))
+    columns = read_columns(files[1], known_names(model))
+    return find_angles(columns, model, np.arange(len(columns)) == 0)
+
+
+def test_angles_that_are_no_orientation_stay_what_they_are(tmp_path: Path) -> None:
+    """Commands, rates, the model's own hinges, and angles beside a quaternion."""
+    angles = ("roll", "pitch", "yaw")
+    frame = rolled_pitched_yawed(angles)
+    others = [f"{name}_{what}" for what in ("cmd", "rate", "des", "vel") for name in angles]
+    assert len(read_turned(written(tmp_path, frame | dict.fromkeys(others, frame["roll"]), FLOATING))) == 1
+    quaternion = {f"mocap_q{axis}": np.full(len(frame["t"]), 0.5) for axis in "wxyz"}
+    assert not read_turned(written(tmp_path, frame | quaternion, FLOATING))
+    hinges = "".join(f'<body><joint name="{name}"/><geom size=".1"/></body>' for name in angles)
+    own = FLOATING.replace("</worldbody>", f"{hinges}</worldbody>")
+    assert not read_turned(written(tmp_path, frame, own))
+    gimbal = own.replace('name="roll"', 'name="gimbal_roll"').replace('name="pitch"', 'name="gimbal_pitch"')
+    gimbal = gimbal.replace('name="yaw"', 'name="gimbal_yaw"')
+    both = frame | {f"gimbal_{name}": frame[name] for name in angles}
+    (found,) = read_turned(written(tmp_path, both, gimbal))
+    assert [c.entry for c in found.columns] == list(angles)
+    hinged = "<mujoco><worldbody>" + hinges + "</worldbody></mujoco>"
+    plain = {"t": frame["t"]} | {name: np.sin((i + 1) * frame["t"]) for i, name in enumerate(angles)}
+    label = matched(tmp_path, plain, hinged)
+    assert [label.get(f"{name}.position") for name in angles] == list(angles)
+
+
 PLANAR = """
 <mujoco><worldbody><body name="body0">
   <joint name="rootx" type="slide" axis="1 0 0"/><joint name="rootz" type="slide" axis="0 0 1"/>
@@ -1315,7 +1442,10 @@ def test_a_body_without_an_orientation_in_the_log_is_named_with_what_to_do(
     frame = {"time": 0.02 * np.arange(200)} | swung(["ball_x", "ball_y", "ball_z", "throw"])
     assert main(["init", *written(tmp_path, frame, xml), "--out", str(tmp_path / "robot.yaml")]) == 2
     error = capfd.readouterr().err
-    assert "the orientation of ball is not in the log; log it as ball_qw, ball_qx, ball_qy, ball_qz" in error
+    assert (
+        "the orientation of ball is not in the log; log it as ball_qw, ball_qx, ball_qy, ball_qz, or as ball_roll, "
+        in error
+    )
     assert "three slides" in error
     assert "joint0" not in error
     del frame["ball_z"]

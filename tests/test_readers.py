@@ -18,6 +18,7 @@ import pytest
 import scipy.io
 import torch
 from pyarrow import feather, parquet
+from scipy.spatial.transform import Rotation
 
 from dropo_torch.data.readers import ReadOptions, read_recording, read_trajectories
 from dropo_torch.data.recording import Recording
@@ -273,6 +274,7 @@ def test_options_without_a_meaning_for_minari_are_refused():
         "next_observations": ["q"], "time": "t", "episode": "e", "terminals": "t", "tolerance": 0.5, "group": "g",
         "separator": ";", "preprocess": {"dt": 0.1}, "scale": {"q": 2.0}, "unwrap": ["q"], "shift": 1, "breaks": [3],
         "pause": 0.5, "joints": ["q"], "stamps": {"q": "t"},
+        "orientations": {"hull": {"angles": ["a", "b", "c"]}},
     }  # fmt: skip
     assert set(given) == {*ReadOptions.__dataclass_fields__} - {"observations", "actions", "dt"}
     for name, value in given.items():
@@ -349,6 +351,91 @@ def test_column_map_scales_renames_and_slices(tmp_path):
     assert log.action_names == ("f",)
     np.testing.assert_array_equal(log.observations[1], [4, 5, 4])
     np.testing.assert_array_equal(log.actions[:, 0], [0, 2, 4, 6])
+
+
+# -- orientations ---------------------------------------------------------------------------------
+
+
+def turning(rows: int = 400, seed: int = 0) -> Rotation:
+    """Orientations along a path that turns over in every direction."""
+    steps = Rotation.from_rotvec(
+        np.array([0.02, 0.03, 0.11]) + 0.02 * np.random.default_rng(seed).normal(size=(rows, 3))
+    )
+    found = [steps[0]]
+    for step in steps[1:]:
+        found.append(found[-1] * step)
+    return Rotation.concatenate(found)
+
+
+@pytest.mark.parametrize("sequence", ["xyz", "XYZ", "ZYX", "zxy", "ZXZ"])
+def test_orientations_of_angles_are_those_that_were_written(tmp_path, sequence):
+    """In whatever unit and sequence, through the wraps of angles, without a flip of the quaternion."""
+    truth = turning()
+    angles = dict(zip("abc", truth.as_euler(sequence, degrees=True).T, strict=True))
+    assert max(np.abs(np.diff(values)).max() for values in angles.values()) > 300
+    angles["b"][7] = np.nan
+    pd.DataFrame({"t": 0.01 * np.arange(400), **angles, "u": 0.0}).to_csv(tmp_path / "log.csv", float_format="%.17g")
+    degrees = [{"signal": name, "scale": np.pi / 180} for name in "abc"]
+    given = {"hull": {"angles": degrees, "sequence": sequence}}
+    log = read_recording(tmp_path / "log.csv", observations="hull", actions="u", time="t", orientations=given)
+    assert log.observation_names == ("hull[w]", "hull[x]", "hull[y]", "hull[z]")
+    assert log.quaternions == (log.observation_names,)
+    assert np.flatnonzero(np.isnan(log.observations).any(axis=1)).tolist() == [7]
+    read = np.delete(log.observations, 7, axis=0)
+    assert (read[1:] * read[:-1]).sum(axis=1).min() > 0.9
+    wrong = Rotation.from_quat(read, scalar_first=True) * truth[np.delete(np.arange(400), 7)].inv()
+    assert wrong.magnitude().max() < 1e-12
+    part = read_recording(tmp_path / "log.csv", observations="hull[z]", actions="u", time="t", orientations=given)
+    np.testing.assert_array_equal(part.observations[:, 0], log.observations[:, 3])
+
+
+def test_roll_pitch_yaw_turn_about_fixed_axes_where_nothing_else_is_said(tmp_path):
+    """So that yaw is the heading: with a roll of a quarter turn, too, it turns about the world's z."""
+    rows = pd.DataFrame({"roll": [np.pi / 2] * 3, "pitch": 0.0, "yaw": [0.0, 0.1, 0.2], "u": 0.0})
+    rows.to_csv(tmp_path / "log.csv", index=False, float_format="%.17g")
+    given = {"hull": {"angles": ["roll", "pitch", "yaw"]}}
+    log = read_recording(tmp_path / "log.csv", observations="hull", actions="u", dt=0.1, orientations=given)
+    read = Rotation.from_quat(log.observations, scalar_first=True)
+    np.testing.assert_allclose((read[2] * read[0].inv()).as_rotvec(), [0, 0, 0.2], atol=1e-12)
+
+
+def test_angles_are_resampled_as_the_orientation_that_they_are(tmp_path):
+    """Between two rows, past a wrap, and with a cell of text where a sample is missing."""
+    time, heading = 0.1 * np.arange(60), 170 + 3.0 * np.arange(60)
+    frame = pd.DataFrame({"t": time, "roll": 0.0, "pitch": 0.0, "yaw": ((heading + 180) % 360 - 180).astype(object)})
+    frame.loc[30, "yaw"] = "ERR"
+    frame.assign(u=0.0).to_csv(tmp_path / "log.csv", index=False)
+    degrees = [{"signal": name, "scale": np.pi / 180} for name in ("roll", "pitch", "yaw")]
+    log = read_trajectories(
+        tmp_path / "log.csv", observations="hull", actions="u", time="t", orientations={"hull": {"angles": degrees}},
+        preprocess={"dt": 0.05, "max_gap": 0.25},
+    )  # fmt: skip
+    quaternion, rates = log.observations[:, :4], log.observations[:, 4:]
+    assert (np.abs(np.linalg.norm(quaternion, axis=1) - 1) < 1e-9).all()
+    turned = Rotation.from_quat(quaternion, scalar_first=True)
+    np.testing.assert_allclose((turned[1:] * turned[:-1].inv()).as_rotvec(degrees=True)[:, 2], 1.5, atol=1e-2)
+    np.testing.assert_allclose(rates, np.radians([[0, 0, 30]] * len(rates)), atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("hull", r"data: orientations is 'hull'; expected names with their angles, such as \{hull: "),
+        ({"hull": ["q", "dq", "u"]}, r"data: orientations: hull is \['q', 'dq', 'u'\]; expected angles, such as"),
+        ({"hull": {}}, r"data: orientations: hull has no angles; expected three columns"),
+        ({"hull[w]": {"angles": ["q", "dq", "u"]}}, r"'hull\[w\]' is no name; expected text without brackets"),
+        ({"hull": {"angels": ["q", "dq", "u"]}}, r"orientations: hull: unknown key 'angels'; did you mean 'angles'"),
+        ({"hull": {"angles": ["q", "dq"]}}, r"orientations: hull: angles are 2 columns \(q, dq\); expected three"),
+        ({"hull": {"angles": ["q", "dq", "v"]}}, r"log\.csv: orientations: hull: there is no 'v'"),
+        ({"hull": {"angles": ["q", "dq", "u"], "sequence": "xyy"}}, r"hull: sequence is 'xyy'; expected three axes"),
+        ({"hull": {"angles": ["q", "dq", "u"], "sequence": "xYz"}}, r"hull: sequence is 'xYz'; expected three axes"),
+        ({"hull": {"angles": ["q", "dq", "u"], "sequence": 3}}, r"hull: sequence is 3; expected three axes"),
+        ({"q": {"angles": ["q", "dq", "u"]}}, r"log\.csv: orientations: q is in the log already; expected another"),
+    ],
+)  # fmt: skip
+def test_orientations_that_cannot_be_read(tmp_path, given, message):
+    path, options = write_csv(tmp_path)
+    fails(message, path, **{**options, "observations": "hull", "orientations": given})
 
 
 # -- bad input ------------------------------------------------------------------------------------
@@ -710,6 +797,8 @@ def test_series_with_other_stamps_need_preprocessing():
     late = trajectory(late=0.01)
     with pytest.raises(InputError, match="stamps of their own"):
         read_trajectories(late, observations="sensordata")
+    with pytest.raises(InputError, match=r"orientations are made of angles in one row, and every signal"):
+        read_trajectories(late, observations="a", orientations={"a": {"angles": ["angle", "speed", "motor_ctrl"]}})
     log = read_trajectories(late, observations="angle", preprocess={"dt": DT})
     np.testing.assert_allclose(log.actions, ACTIONS[:2], atol=1e-12)
 

@@ -78,7 +78,7 @@ def _show(proposal: Proposal, path: Path, page: Path, took: float, console: Cons
 
     console.print(columns_table(proposal.matching))
     console.print(parameters_table(proposal.choice))
-    for line in (proposal.rate, proposal.window, *proposal.draft.notes):
+    for line in (proposal.rate, proposal.window, *proposal.draft.turned, *proposal.draft.notes):
         console.print(line, soft_wrap=True)
     console.print(f"Of {len(proposal.choice.told)} physical parameters, {proposal.choice.summary}.", soft_wrap=True)
     for finding in proposal.findings:

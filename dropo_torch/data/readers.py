@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dropo_torch.data.angles import check_orientations, with_orientations
 from dropo_torch.data.corrections import Corrections, break_rows, corrected
 from dropo_torch.data.formats import missing_file, open_tables
 from dropo_torch.data.memory import in_memory
@@ -55,6 +56,7 @@ class ReadOptions:
     pause: float | None = None
     joints: Sequence[str] | None = None
     stamps: Mapping[str, str] | None = None
+    orientations: Mapping[str, Mapping[str, Any]] | None = None
 
     @property
     def corrections(self) -> Corrections:
@@ -73,6 +75,8 @@ class ReadOptions:
                 raise InputError(f"data: {name} is {value!r}; expected text")
         if isinstance(self.joints, str) or not isinstance(self.joints or [], Sequence):
             raise InputError(f"data: joints is {self.joints!r}; expected a list of names")
+        if self.orientations is not None:
+            check_orientations(self.orientations)
         if isinstance(self.preprocess, Mapping):
             object.__setattr__(self, "preprocess", Preprocess.from_mapping(self.preprocess))
         elif self.preprocess is not None and not isinstance(self.preprocess, Preprocess):
@@ -100,6 +104,7 @@ def read_trajectories(
     pause: float | None = None,
     joints: Sequence[str] | None = None,
     stamps: Mapping[str, str] | None = None,
+    orientations: Mapping[str, Mapping[str, Any]] | None = None,
     base: str | Path | None = None,
 ) -> Trajectories:
     """Read one or more logs.
@@ -131,6 +136,9 @@ def read_trajectories(
         pause: seconds without a measurement after which an episode begins.
         joints: of signals whose columns are joints, those that are meant, in the model's order.
         stamps: of a bag: topic → ``received`` or a clock's topic, whence it takes its time instead of from headers.
+        orientations: name → ``{angles: [roll, pitch, yaw], sequence: xyz}``: three columns in rad that are read as a
+            quaternion of that name, with columns w, x, y, z. ``sequence`` is that of SciPy's ``Rotation.from_euler``;
+            ``xyz``, the default, turns about the fixed axes x, y and z in this order.
         base: folder from which relative paths start, by default the current one.
 
     Raises:
@@ -138,7 +146,7 @@ def read_trajectories(
     """
     options = ReadOptions(
         observations, next_observations, actions, time, episode, terminals, dt, tolerance, group, separator, preprocess,
-        scale, unwrap, shift, breaks, pause, joints, stamps,
+        scale, unwrap, shift, breaks, pause, joints, stamps, orientations,
     )  # fmt: skip
     return concatenate(_read(source, options, Path(base or ".")))
 
@@ -155,14 +163,18 @@ def read_recording(
     separator: str | None = None,
     joints: Sequence[str] | None = None,
     stamps: Mapping[str, str] | None = None,
+    orientations: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Recording:
     """Read one log as samples in time; the arguments are those of :func:`read_trajectories`.
 
     Raises:
         InputError: a file, name or value that cannot be used; its one line says which.
     """
-    options = ReadOptions(observations, None, actions, time, episode, terminals, dt, joints=joints)
-    return _recording(open_tables(Path(path), separator=separator, stamps=stamps)[0], options)
+    options = ReadOptions(
+        observations, None, actions, time, episode, terminals, dt, joints=joints, orientations=orientations
+    )  # fmt: skip
+    table = open_tables(Path(path), separator=separator, stamps=stamps)[0]
+    return _recording(with_orientations(table, orientations), options)
 
 
 def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories]:
@@ -213,6 +225,7 @@ def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
 
 
 def _read_table(table: Table, options: ReadOptions) -> Trajectories:
+    table = with_orientations(table, options.orientations, lenient=_bridges(options))
     if isinstance(options.preprocess, Preprocess):
         if options.next_observations is not None:
             raise InputError(

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from dropo_torch.data.tables import Choice, Table, missing, numbers
 from dropo_torch.errors import InputError
 from dropo_torch.proposal.words import Words, actual, body_rates, by_family, desired, read_name
 from dropo_torch.support.given import MOST_TEXT
+
+if TYPE_CHECKING:
+    from dropo_torch.proposal.angles import Angles
 
 #: Columns of a matrix beyond which it is a picture or a cloud of points, and no state.
 WIDEST = 200
@@ -43,6 +46,7 @@ class Column:
         transposed: whether the array holds a sample in each column.
         words: what its name says.
         label: what the file calls it in its array; empty where that has no names.
+        made_of: the columns that it was made of, in words; empty for one that the file has.
     """
 
     entry: str
@@ -53,6 +57,7 @@ class Column:
     transposed: bool
     words: Words = field(default_factory=Words)
     label: str = ""
+    made_of: str = ""
 
     @property
     def moves(self) -> bool:
@@ -89,6 +94,7 @@ class Columns:
         stamps: of a bag, as a config has them.
         apart: seconds between samples, where each signal has time stamps of its own: those of the fastest that is no
             command, at whose stamps columns are then interpolated.
+        orientations: those that are told by angles, in the place of whose columns quaternions are.
     """
 
     paths: tuple[Path, ...]
@@ -99,6 +105,7 @@ class Columns:
     separator: str | None = None
     stamps: Mapping[str, str] = field(default_factory=dict)
     apart: float | None = None
+    orientations: tuple[Angles, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of rows."""

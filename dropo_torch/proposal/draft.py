@@ -55,6 +55,7 @@ class Draft:
         findings: what an examination still finds.
         notes: what was done and why, in words.
         smooth: the filter of noisy positions whose velocities are derived, or ``None``.
+        turned: what columns of angles are, in words.
     """
 
     document: dict[str, Any]
@@ -62,6 +63,7 @@ class Draft:
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
     smooth: Filter | None = None
+    turned: tuple[str, ...] = ()
 
     def noted(self, note: str) -> Draft:
         """Return the draft with one more note, as the first."""
@@ -167,6 +169,8 @@ def _source(reading: Reading) -> dict[str, Any]:
     source |= {} if columns.group is None else {"group": columns.group}
     source |= {} if columns.separator is None else {"separator": columns.separator}
     source |= {"stamps": dict(columns.stamps)} if columns.stamps else {}
+    orientations = {a.name: a.entry for a in columns.orientations if reading.matching.array(a.name)}
+    source |= {"orientations": orientations} if orientations else {}
     if columns.apart is not None:
         pass  # time stamps are the signals' own
     elif clock.column is None or clock.by_rows:

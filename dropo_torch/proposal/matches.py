@@ -90,6 +90,10 @@ class Matching:
         """Return the match of a place, or ``None``."""
         return next((m for m in self.matches if m.place.label == label), None)
 
+    def array(self, name: str) -> tuple[Match, ...]:
+        """Return the matches whose columns are of an array."""
+        return tuple(m for m in self.matches if m.column.array == name)
+
     def lacks(self, kind: str) -> tuple[Place, ...]:
         """Return the places of a kind that have no column."""
         return tuple(p for p in self.missing if p.kind == kind)

@@ -164,6 +164,7 @@ def _assigned(
 def _matched(place: Place, column: Column, words: Words, name: float, share: float) -> Match:
     """A match, with what it was found by."""
     spoken = "its name" if words.objects or words.axis else "its number" if words.numbers else "its kind"
+    spoken = column.made_of or spoken
     seen = f"motion (r² {share:.2f})" if share > LIKE else ""
     by = f"{spoken} and {seen}" if name >= LEAST and seen else spoken if name >= LEAST else f"its {seen or 'motion'}"
     sureness: Sureness = "sure" if name >= SURE or (name >= LEAST and share > LIKE) else "likely"

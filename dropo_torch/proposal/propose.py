@@ -19,6 +19,7 @@ from dropo_torch.data.observation import joint_name
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import load_model
 from dropo_torch.problem import make_problem
+from dropo_torch.proposal.angles import find_angles, with_angles
 from dropo_torch.proposal.candidates import Candidate, all_candidates
 from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
@@ -214,7 +215,7 @@ def _robot(model: mujoco.MjModel, path: Path, out: Path, columns: Columns) -> _R
 def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review | None) -> Reading:
     """Which column is which number of the model and when rows were taken, with the model of which they are rows."""
     places = places_of(robot.model)
-    matching, clock = _matched(columns, places, find_clock(columns, robot.step, dt), robot.step)
+    columns, matching, clock = _turned(columns, robot, places, find_clock(columns, robot.step, dt))
     matching = with_base(_without_dependent(matching, robot.model), robot.model, places)
     matching, path = _marked(robot, columns, matching, clock)
     if review is not None:
@@ -231,6 +232,18 @@ def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review |
     base = robot.out.resolve().parent
     data = [_relative(p, base) for p in columns.paths]
     return Reading(_relative(path, base), data, columns, matching, places, clock, step, base)
+
+
+def _turned(columns: Columns, robot: _Robot, places: Sequence[Place], clock: Clock) -> tuple[Columns, Matching, Clock]:
+    """Columns, with quaternions in the place of the angles that tell an orientation, what they are, and the clock."""
+    found = find_angles(columns, robot.model, clock.starts(len(columns), columns.parts))
+    told = with_angles(columns, found)
+    matching, checked = _matched(told, places, clock, robot.step)
+    used = [a for a in found if matching.array(a.name)]
+    if len(used) < len(found):
+        told = with_angles(columns, used)
+        matching, checked = _matched(told, places, clock, robot.step)
+    return told, matching, checked
 
 
 def _loops(matching: Matching, model: mujoco.MjModel) -> Loops | None:
@@ -258,6 +271,7 @@ def _without_motors(matching: Matching) -> Matching:
 def _drafted(reading: Reading, robot: _Robot) -> Draft:
     """The config's keys but noise and parameters, with notes of what it does that the log does not say by itself."""
     draft = make_draft(reading)
+    draft = replace(draft, turned=_orientations(reading, robot.model))
     if (loops := _loops(reading.matching, robot.model)) is not None:
         draft = draft.noted(
             f"{', '.join(loops.names)}: no column shows them; they are where the model's equality constraints are met"
@@ -273,6 +287,12 @@ def _drafted(reading: Reading, robot: _Robot) -> Draft:
         f"rows {reading.clock.dt:.6g} s apart are no whole number of the model's steps of {robot.step:g} s: "
         f"{Path(reading.model).name} is the model with steps of {reading.timestep:g} s"
     )
+
+
+def _orientations(reading: Reading, model: mujoco.MjModel) -> tuple[str, ...]:
+    """What the columns of angles are, in words."""
+    found = [(a, reading.matching.array(a.name)) for a in reading.columns.orientations]
+    return tuple(a.said_of(_body(model, matches[0].place.joint)) for a, matches in found if matches)
 
 
 def _chosen(candidates: Sequence[Candidate], found: Information, review: Review | None) -> Choice:
@@ -434,7 +454,7 @@ def _lacking(lacking: Sequence[Place], model: mujoco.MjModel, free: Sequence[str
         name = _body(model, j)
         free_joint = int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE
         slides = ", or give the model three slides along x, y and z instead of the free joint" if free_joint else ""
-        columns = ", ".join(f"{name}_q{axis}" for axis in "wxyz")
+        columns = ", ".join(f"{name}_q{axis}" for axis in "wxyz") + f", or as {name}_roll, {name}_pitch, {name}_yaw"
         said.append(f"the orientation of {name} is not in the log; log it as {columns}{slides}")
     for j in nowhere:
         name = _body(model, j)

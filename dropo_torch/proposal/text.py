@@ -26,6 +26,7 @@ def config_text(proposal: Proposal) -> str:
         "",
         _key("model", document["model"]),
         "",
+        *(line for turned in proposal.draft.turned for line in _comment(turned)),
         *(f"# {line}" for line in _columns(proposal)),
         _key("data", document["data"]),
         "",

@@ -189,6 +189,7 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
     commanded: Role = ""
     if any(_role(word) in ("position", "velocity", "acceleration") for word in words):
         words = [word for word in words if word not in _CURRENT]
+    forces = unit_role(name) == "effort" and any(_role(word) == "command" for word in words)
     for word in words:
         short = _short(word)
         if short is not None and short[0] == "acceleration" and (scale or any(map(_role, words))):
@@ -202,6 +203,7 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
             continue
         role = "command" if word in driven or (percent and word in _OPENS) else _role(word)
         role = "other" if word in _VOLTAGE - driven else role
+        role = "" if forces and len(word) == 1 and role in ("position", "velocity") else role  # cmd_v_N: vertical
         if role:
             roles.append(role)
             commanded = "position" if word in _TARGETS and not commanded else commanded

@@ -52,7 +52,7 @@ def write_init_report(path: str | Path, proposal: Proposal, *, seconds: float, *
         "columns": [_column(m) for m in proposal.matching.matches],
         "missing": [p.label for p in proposal.matching.missing],
         "unused": [c.entry for c in proposal.matching.unused],
-        "notes": [proposal.rate, proposal.window, *proposal.draft.notes],
+        "notes": [proposal.rate, proposal.window, *proposal.draft.turned, *proposal.draft.notes],
         "found": proposal.findings,
         "noise": list(zip(proposal.labels, proposal.units, proposal.noise.tolist(), strict=True)),
         "panels": _panels(proposal, step),
