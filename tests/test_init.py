@@ -186,6 +186,15 @@ def test_p_q_and_r_together_are_body_rates() -> None:
     assert body_rates(["p", "q", "q2", "r"])[0] == "p"
 
 
+@pytest.mark.parametrize("name", ["{}_rate_dps", "{}speed_dps", "{}_vel_deg_s"])
+def test_rates_of_roll_pitch_and_yaw_are_body_rates(name: str) -> None:
+    names = ["t", *(name.format(word) for word in ("roll", "pitch", "yaw")), "roll_deg", "pitch_deg", "yaw_deg"]
+    found = [read_name(called) for called in body_rates(names)]
+    assert [(w.axis, w.angular) for w in found[1:4]] == [(a, True) for a in "xyz"]
+    assert body_rates(names)[4:] == names[4:]
+    assert body_rates(names, ["yaw_joint"]) == names
+
+
 def test_a_family_may_be_called_after_what_measures_it() -> None:
     joints = ["sled", "sled_x", "sled_y", "sled_yaw", "table"]
     assert by_family(["t", "cam_x_mm", "cam_y_mm", "cam_yaw_mrad"], joints)[1:] == [

@@ -257,22 +257,39 @@ def desired(names: Sequence[str], alike: Callable[[int, int], bool]) -> list[str
     return found
 
 
-def body_rates(names: Sequence[str], known: Sequence[str] = ()) -> list[str]:
-    """Return names in which lone letters ``p``, ``q`` and ``r``, where each stands once, are gyroscopes' axes.
+#: Words of angular velocities of a body whose angles are roll, pitch and yaw.
+_BODY_RATES = _set("rate rates speed vel velocity dot")
 
-    So flight logs call the angular velocities about a body's axes; where only some stand, ``q`` is a position.
+
+def body_rates(names: Sequence[str], known: Sequence[str] = ()) -> list[str]:
+    """Return names in which ``p``, ``q`` and ``r``, or ``roll_rate``, ``pitchspeed``, ..., are gyroscopes' axes.
+
+    So flight logs call the angular velocities about a body's axes. Each of the three must stand once; where only some
+    do, ``q`` is a position.
 
     Args:
         names: of columns.
         known: names of the model's objects, which they may be, too.
     """
     bare = [[w for w in _unit(split(name))[0] if not w.isdigit()] for name in names]
-    axes = {letter: [i for i, words in enumerate(bare) if words == [letter]] for letter in "pqr"}
-    found = list(names)
-    if all(len(at) == 1 for at in axes.values()) and not axes.keys() & {name.lower() for name in known}:
-        for letter, axis in zip("pqr", _AXES, strict=True):
-            found[axes[letter][0]] = f"gyro {axis} {_unit_words(names[axes[letter][0]])}".strip()
+    found, objects = list(names), [split(name) for name in known]
+    for kind, rated in ((("p", "q", "r"), False), (("roll", "pitch", "yaw"), True)):
+        at = {word: [i for i, words in enumerate(bare) if _is_rate(words, word, rated=rated)] for word in kind}
+        own = any(word in words if rated else words == [word] for word in kind for words in objects)
+        if all(len(rows) == 1 for rows in at.values()) and not own:
+            for word, axis in zip(kind, _AXES, strict=True):
+                found[at[word][0]] = f"gyro {axis} {_unit_words(names[at[word][0]])}".strip()
     return found
+
+
+def _is_rate(words: Sequence[str], word: str, *, rated: bool) -> bool:
+    """Whether words are one alone, or one and that it is a rate, written apart or together."""
+    if not rated:
+        return list(words) == [word]
+    rest = [w.removeprefix(word) for w in words]
+    return (
+        sum(w.startswith(word) for w in words) == 1 and {w for w in rest if w} < _BODY_RATES and len("".join(rest)) > 0
+    )
 
 
 def by_family(names: Sequence[str], known: Sequence[str]) -> list[str]:
