@@ -18,6 +18,7 @@ from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.placing import plain_setting
 from dropo_torch.effects.presliding import PAST
 from dropo_torch.gap import prepare
+from dropo_torch.gap.refit import derivatives
 
 GIVES = {"compliance": 1 / 300, "damping": 3.0, "inertia": 0.5}
 #: Episodes in which what a rotor was before is forgotten long before their middle.
@@ -68,6 +69,29 @@ def test_bristles_follow_the_motion_before_a_simulation() -> None:
     speed[0, :42] = np.nan  # an episode that begins there: as if the joint had moved so before
     ((begun, _),) = placed.effect.replay(setting, "hinge", np.array([placed.values]), angle, speed, drive)
     assert begun == pytest.approx(1 - np.exp(-0.4 * (PAST + 2 * dt) / 0.1))
+
+
+def test_a_transmission_moves_in_its_compliance_and_products() -> None:
+    """A spring twice as soft, with half the damping and half the rotor, is nearly the same below its resonance."""
+    effect, start = find_effect("joint_elasticity"), np.array([1 / 300, 3.0, 0.5])
+    along = effect.directions(start)
+    for share in (0.02, 1.0, -0.5):
+        there = effect.settle(start, start + share * start[0] * along[0])
+        np.testing.assert_allclose(there[0] * there[1:], start[0] * start[1:])
+        assert there[0] == pytest.approx((1 + share) * start[0])
+    np.testing.assert_array_equal(along[1:], np.eye(3)[1:])
+    np.testing.assert_array_equal(effect.settle(np.zeros(3), start), start)
+
+
+def test_derivatives_follow_from_moves_of_several_numbers() -> None:
+    rng = np.random.default_rng(0)
+    slope, moves = rng.normal(size=(3, 2, 5)), np.array([[1e-3, -2e-3, 4e-4], [0, 1e-3, 0], [0, 0, -1e-3]])
+    np.testing.assert_allclose(derivatives(np.einsum("kc,cwn->kwn", moves, slope), moves), slope)
+    changes = np.einsum("kc,cwn->kwn", np.diag(np.diag(moves)), slope)
+    changes[1, 0] = np.nan  # a simulation that diverges says nothing of the other numbers
+    found = derivatives(changes, np.diag(np.diag(moves)))
+    np.testing.assert_allclose(found[[0, 2]], slope[[0, 2]])
+    assert np.isnan(found[1, 0]).all()
 
 
 def test_a_rotor_goes_on_from_the_rows_before() -> None:

@@ -229,6 +229,13 @@ class Effect(abc.ABC):
         """
         return values
 
+    def directions(self, values: np.ndarray) -> np.ndarray:
+        """Return the moves of the values along which differences are taken, ``(p, p)``; by default of each alone.
+
+        Where a move of several at once changes next to nothing, that does not follow from what each alone changes.
+        """
+        return np.eye(len(values))
+
     def eased(self, setting: Setting, values: tuple[float, ...]) -> tuple[float, ...]:
         """Return values under which a simulation costs less and changes alike with initial states and other numbers."""
         return values

@@ -131,6 +131,11 @@ class ContactFriction(ContactEffect):
     name = "contact_friction"
     sentence = "the sliding friction of {target} is not the model's"
 
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return them, those of larger friction first: MuJoCo takes the larger one of a pair."""
+        model = setting.model
+        return sorted(super().targets(setting), key=lambda t: -model.geom_friction[object_number(model, "geom", t), 0])
+
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         own = self.own(setting.model, target)
         return (Quantity("friction", "-", own, 0.01 * own, max(5.0, 5 * own), 0.3 * max(own, LEAST)),)

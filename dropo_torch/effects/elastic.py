@@ -92,6 +92,13 @@ class JointElasticity(DrivenJointEffect):
         products = start[0] * values[1:] + start[1:] * (values[0] - start[0])
         return np.concatenate([[compliance], np.maximum(products, 0.0) / compliance])
 
+    def directions(self, values: np.ndarray) -> np.ndarray:
+        """Return the move of the compliance in which its products with damping and inertia stay, and those of these."""
+        found = np.eye(len(values))
+        if values[0] > 0:
+            found[0, 1:] = -values[1:] / values[0]
+        return found
+
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         if values[0] == 0:
             return

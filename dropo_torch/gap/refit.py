@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
+from scipy.linalg import block_diag
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
@@ -90,6 +91,12 @@ class Hypothesis:
         pairs = zip(self.placed, there, strict=True)
         values = [own.effect.settle(np.array(own.values), np.array(new.values)) for own, new in pairs]
         return np.concatenate([vector[: len(self.declared)], *values])
+
+    @property
+    def directions(self) -> np.ndarray:
+        """The moves of all numbers along which differences are taken, ``(q, q)``."""
+        blocks = [p.effect.directions(np.array(p.values)) for p in self.placed]
+        return np.asarray(block_diag(np.eye(len(self.declared)), *blocks))
 
     def with_effects(self, placed: Sequence[Placed]) -> Hypothesis:
         """Return the same with more effects."""
@@ -174,7 +181,9 @@ class Refit:
 def beside(
     hypothesis: Hypothesis, limits: Limits, columns: np.ndarray, step: float
 ) -> tuple[list[Hypothesis], np.ndarray]:
-    """Return hypotheses in which one number each is moved, and by how much in units of its scale; within bounds.
+    """Return hypotheses that are moved a little, and their moves ``(c, c)`` in units of the numbers' scales.
+
+    Each moves one number, or several along one of its effect's :meth:`~Effect.directions`.
 
     Args:
         hypothesis: where the differences are taken.
@@ -185,8 +194,8 @@ def beside(
     vector, own = hypothesis.vector, limits.of(columns)
     steps = np.where(vector[columns] + step * own.scale <= own.high, step, -step)
     changes = np.zeros((len(columns), len(vector)))
-    changes[np.arange(len(columns)), columns] = steps * own.scale
-    return [hypothesis.at(vector + change) for change in changes], steps
+    changes[:, columns] = (steps * own.scale)[:, None] * hypothesis.directions[np.ix_(columns, columns)]
+    return [hypothesis.at(vector + change) for change in changes], changes[:, columns] / own.scale
 
 
 def refit(
@@ -319,9 +328,20 @@ def _differences(
     evidence: Evidence, here: Refit, limits: Limits, residuals: np.ndarray, columns: np.ndarray, step: float
 ) -> np.ndarray:
     """Derivatives by some numbers ``(c, W, N)``, each moved by a step in its scale, from residuals ``(W, N)``."""
-    moved, steps = beside(here.hypothesis, limits, columns, step)
+    moved, moves = beside(here.hypothesis, limits, columns, step)
     changes = evidence.changes(here.hypothesis.variant, residuals, [h.variant for h in moved])
-    return evidence.project_slope(changes / steps[:, None, None], here.linear)
+    return evidence.project_slope(derivatives(changes, moves), here.linear)
+
+
+def derivatives(changes: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Return derivatives by numbers ``(c, W, N)``, in units of their scales, of changes along some of their moves.
+
+    Args:
+        changes: of residuals, ``(c, W, N)``, NaN where a simulation diverges; other numbers do not care.
+        moves: see :func:`beside`.
+    """
+    slopes = [sum(row[k] * changes[k] for k in np.flatnonzero(row)) for row in np.linalg.inv(moves)]
+    return np.reshape(slopes, changes.shape)
 
 
 def _fitted(

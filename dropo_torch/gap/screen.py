@@ -19,7 +19,7 @@ from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.engine import Variant, parts
 from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.limbs import by_limbs
-from dropo_torch.gap.refit import Hypothesis, Limits, Refit, beside, limits_of, refit
+from dropo_torch.gap.refit import Hypothesis, Limits, Refit, beside, derivatives, limits_of, refit
 from dropo_torch.gap.rules import Tried
 
 #: Difference step of a candidate's numbers, relative to their scale.
@@ -216,7 +216,7 @@ class _Plan:
         variant: the hypothesis with it.
         moving: which of its numbers move, ``(q,)``.
         limits: bounds and scales of these.
-        steps: differences by which they move, in units of their scale, ``(q,)``.
+        moves: by which they are moved, in units of their scales, ``(q, q)``.
         rows: the simulations that belong to it.
     """
 
@@ -224,7 +224,7 @@ class _Plan:
     variant: Variant
     moving: np.ndarray
     limits: Limits
-    steps: np.ndarray
+    moves: np.ndarray
     rows: slice
 
     @property
@@ -261,20 +261,20 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
         limits = limits_of(hypothesis, evidence.twin)
         moving = moving[limits.free[len(hypothesis.vector) - size + moving]]
         columns = len(hypothesis.vector) - size + moving
-        moved, steps = beside(hypothesis, limits, columns, STEP)
+        moved, moves = beside(hypothesis, limits, columns, STEP)
         begins = [] if placed.is_neutral(evidence.twin.setting) and not placed.effect.is_filter else [hypothesis]
         own = [h.variant for h in (*begins, *moved)]
         rows = slice(len(variants), len(variants) + len(own))
         variants += own
-        plans.append(_Plan(placed, hypothesis.variant, moving, limits.of(columns), steps, rows))
+        plans.append(_Plan(placed, hypothesis.variant, moving, limits.of(columns), moves, rows))
     found = focus.beside(variants)
     before, shared = focus.residual, focus.slope
     for plan in plans:
-        size = len(plan.steps)
+        size = len(plan.moves)
         begin, *there = found[plan.rows] if size < len(found[plan.rows]) else (focus.simulated, *found[plan.rows])
         residual = evidence.project(begin, linear).ravel() * factor
-        change = (np.reshape(there, (size, *begin.shape)) - begin) / plan.steps[:, None, None]
-        slope = evidence.project_slope(change, linear).reshape(size, factor.size) * factor
+        changes = np.reshape(there, (size, *begin.shape)) - begin
+        slope = evidence.project_slope(derivatives(changes, plan.moves), linear).reshape(size, factor.size) * factor
         known = evidence.twin.knows(plan.variant, evidence.windows)
         here = np.repeat(known, len(residual) // len(known))  # windows whose commands it does not know stay as they are
         residual, slope = np.where(here, residual, before), slope * here
@@ -290,7 +290,7 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
 
 def _move(columns: np.ndarray, residual: np.ndarray, plan: _Plan) -> np.ndarray:
     """Least-squares move whose last entries, those of the candidate's own numbers, stay within bounds."""
-    normal, shared = columns @ columns.T, len(columns) - len(plan.steps)
+    normal, shared = columns @ columns.T, len(columns) - len(plan.moves)
     diagonal = np.diag(normal)
     damped = normal + np.diag(DAMPING * diagonal + RIDGE * diagonal.max(initial=1e-300))
     move = np.linalg.solve(damped, -(columns @ residual))
