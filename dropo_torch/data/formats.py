@@ -4,7 +4,8 @@
 ``.npz``                           arrays ``observations``, ``next_observations``, ``actions``, ``terminals``
 folder, ``*_observations.npy``     the same with ``*_nextobservations``, ``*_actions``, ``*_terminals``
 ``.h5``, ``.hdf5``                 data sets in the layout of D4RL, or any others by a column map
-``.csv``, ``.tsv``, ``.parquet``   by a column map
+``.csv``, ``.txt``, ``.parquet``   and the like, by a column map
+``.jsonl``                         an object a line, by a column map
 ``.mat``                           MATLAB variables (all versions), by a column map
 ``.feather``, ``.arrow``           as Parquet
 ``.bag``, ``.mcap``, ``.db3``      ROS bags, as a ROS 2 bag's folder: fields of messages by a column map
@@ -22,7 +23,6 @@ import io
 import json
 import math
 import re
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,21 +35,17 @@ import numpy as np
 from dropo_torch.data.bags import is_bag, open_bag
 from dropo_torch.data.lerobot import is_lerobot, open_lerobot
 from dropo_torch.data.sysid import is_sysid, sysid_table
-from dropo_torch.data.tables import Table
+from dropo_torch.data.tables import Table, frame_table
+from dropo_torch.data.text import TEXT, open_text
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.child import read_in_child
 from dropo_torch.support.extras import extra
-from dropo_torch.support.given import MOST_TEXT, check_size, reading
+from dropo_torch.support.given import check_size, reading
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
-#: Numbers with a comma before their decimals, and whole ones with one before every thousand, which look alike.
-_DECIMAL_COMMA = r"[-+]?\d*(,\d*)?([eE][-+]?\d+)?"
-_THOUSANDS = r"[-+]?(0|[1-9]\d{0,2}(,\d{3})*)"
 
-#: How lines begin that are comments.
-_COMMENTS = ("#", "%", "//")
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -87,73 +83,14 @@ def open_npy(path: Path, _: str | None) -> list[Table]:
     return [Table(str(folder), tuple(name for name, file in files.items() if file.exists()), read)]
 
 
-def open_text(path: Path, separator: str | None) -> list[Table]:
-    """Text in columns, the first row naming them, or the last line of a comment above them."""
+def open_json_lines(path: Path, _: str | None) -> list[Table]:
+    """An object in each line, one a sample; what is nested is called ``elbow.position``."""
     with extra("formats", str(path)):
         import pandas as pd
-    separator = separator or ("\t" if path.suffix.lower() == ".tsv" else ",")
-    skipped, comment = comment_above(path)
-    with (
-        reading(path, "a table of text"),
-        warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
-    ):
-        read: Callable[..., Any] = partial(
-            pd.read_csv, sep=r"\s+" if separator == " " else separator, skipinitialspace=True, index_col=False,
-            low_memory=False,
-        )  # fmt: skip
-        first = partial(read, header=None, nrows=1, dtype=str, keep_default_na=False)
-        read, head = partial(read, path, skiprows=skipped), first(path, skiprows=skipped).iloc[0]
-        if comment and any(map(_is_number, head)):
-            read, width = partial(read, header=None), len(head)
-            head = first(io.StringIO(comment)).iloc[0]
-            if len(head) != width:
-                raise InputError(
-                    f"{path}: the comment above the rows has {len(head)} names and they have {width} columns; "
-                    "expected a name for each"
-                )
-        frame = read()
-        if separator != "," and _has_decimal_commas(frame):
-            frame = read(decimal=",")
-        frame.columns = pd.Index([name.strip() or f"Unnamed: {i}" for i, name in enumerate(head)])
-    twice = frame.columns[frame.columns.duplicated()]
-    if len(twice):
-        raise InputError(f"{path}: two columns are named {str(twice[0])!r}; give each a name of its own")
-    for name in frame.columns[[kind.kind not in "biuf" for kind in frame.dtypes]]:
-        rows = np.flatnonzero(frame[name].astype(str).str.contains("[\n\r]"))
-        if rows.size:
-            raise InputError(
-                f"{path}: {name} has a line break at row {rows[0]} (counted from 0); is a quotation mark left open?"
-            )
-    only = str(frame.columns[0])
-    other = next((mark for mark in ";\t, " if mark != separator and mark in only), None)
-    if len(frame.columns) == 1 and other is not None:
-        raise InputError(f"{path}: its one column is {only!r}; separator: {other!r} may be what is meant")
+    with reading(path, "an object of JSON in each line"), path.open(encoding="utf-8-sig") as file:
+        rows = [json.loads(line) for line in file if line.strip()]
+        frame = pd.json_normalize(rows)
     return [frame_table(str(path), frame)]
-
-
-def comment_above(path: Path) -> tuple[int, str | None]:
-    """Return how many lines at the top of a text file are comments, and what the last of them says, if any."""
-    said, count = None, 0
-    with path.open("rb") as file:
-        while (line := file.readline(MOST_TEXT).decode("utf-8-sig", errors="replace").strip()).startswith(_COMMENTS):
-            said, count = line.lstrip("".join(_COMMENTS)).strip(), count + 1
-    return count, said
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace(",", "."))
-    except ValueError:
-        return False
-    return True
-
-
-def _has_decimal_commas(frame: pd.DataFrame) -> bool:
-    """Whether columns of text are numbers with a comma before their decimals, and not one before every thousand."""
-    kinds = [kind.kind not in "biuf" for kind in frame.dtypes]
-    texts = [frame[name].dropna().astype(str).str.strip() for name in frame.columns[kinds]]
-    numbers = [t for t in texts if len(t) and t.str.fullmatch(_DECIMAL_COMMA).all()]
-    return any(not t.str.fullmatch(_THOUSANDS).all() for t in numbers)
 
 
 def open_parquet(path: Path, _: str | None) -> list[Table]:
@@ -258,7 +195,8 @@ ROS = Format("ROS bag", (".bag", ".mcap", ".db3"), open_bag, option="stamps")
 FORMATS = (
     Format("NumPy archive", (".npz",), open_npz),
     NPY,
-    Format("text", (".csv", ".tsv", ".txt"), open_text, option="separator"),
+    Format("text", TEXT, open_text, option="separator"),
+    Format("JSON lines", (".jsonl", ".ndjson"), open_json_lines),
     Format("Parquet", (".parquet", ".pq"), open_parquet),
     Format("Feather", (".feather", ".arrow"), open_feather),
     Format("HDF5", (".h5", ".hdf5"), open_hdf5, option="group"),
@@ -304,17 +242,6 @@ def open_tables(
                 f"{path}: {option} is an option of {owner.name} files ({', '.join(owner.suffixes)}); leave it out here"
             )
     return kind.open(path, given[kind.option] if kind.option else None)
-
-
-def frame_table(source: str, frame: pd.DataFrame) -> Table:
-    """Return the columns of a data frame, and of its index where that has names."""
-    if any(name is not None for name in frame.index.names):
-        frame = frame.reset_index()
-    columns = {str(name): i for i, name in enumerate(frame.columns)}
-    if len(columns) < frame.shape[1]:
-        name = next(str(n) for i, n in enumerate(frame.columns) if columns[str(n)] != i)
-        raise InputError(f"{source}: two columns are named {name!r}; give each a name of its own")
-    return Table(source, tuple(columns), lambda name: frame.iloc[:, columns[name]].to_numpy())
 
 
 def missing_file(path: Path) -> str:

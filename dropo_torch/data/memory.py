@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.data import sysid
-from dropo_torch.data.formats import frame_table
-from dropo_torch.data.tables import Table
+from dropo_torch.data.tables import Table, frame_table
 
 
 def in_memory(source: Any) -> Table | None:

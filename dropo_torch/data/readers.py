@@ -8,6 +8,7 @@ same episode.
 from __future__ import annotations
 
 import glob
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -30,6 +31,8 @@ from dropo_torch.support.given import check_keys, number, reading, user_path
 
 #: A path, options with one, what is in memory (a data frame, arrays, a time series), or several of these.
 Source = str | Path | Mapping[str, Any] | Sequence["Source"] | Any
+#: Times of day.
+_CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}(\.\d+)?")
 #: Options that mean nothing for a log whose signals have time stamps of their own.
 _OF_ROWS = ("next_observations", "time", "dt", "episode", "terminals", "shift", "breaks")
 
@@ -417,6 +420,10 @@ def dates_in_seconds(stamps: np.ndarray, where: str) -> np.ndarray:
     """
     import pandas as pd
 
+    texts = [str(stamp).strip().replace(",", ".") for stamp in stamps]
+    if all(map(_CLOCK.fullmatch, texts)):
+        seconds = np.asarray(pd.to_timedelta(texts) / pd.Timedelta(seconds=1), dtype=np.float64)
+        return np.asarray(np.unwrap(seconds - seconds[0], period=86400.0))  # after midnight, it goes on
     with reading(where, "dates such as 2024-05-01T12:00:00.125"):
         dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
     return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from dropo_torch.data.trajectory import column_names
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.extras import extra
 from dropo_torch.support.given import check_keys, number
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ColumnMap = str | int | Mapping[str, Any] | Sequence[Any]
 Index = slice | tuple[str, ...]
@@ -203,6 +206,17 @@ class Table:
                 f"{self.source}: {what}: scale {signal.scale!r} has shape {factor.shape}; expected a scalar"
             )
         return float(factor.reshape(()))
+
+
+def frame_table(source: str, frame: pd.DataFrame) -> Table:
+    """Return the columns of a data frame, and of its index where that has names."""
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    columns = {str(name): i for i, name in enumerate(frame.columns)}
+    if len(columns) < frame.shape[1]:
+        name = next(str(n) for i, n in enumerate(frame.columns) if columns[str(n)] != i)
+        raise InputError(f"{source}: two columns are named {name!r}; give each a name of its own")
+    return Table(source, tuple(columns), lambda name: frame.iloc[:, columns[name]].to_numpy())
 
 
 def split_index(text: str) -> tuple[str, Index | None]:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dropo_torch.data.bags import unstamped
-from dropo_torch.data.formats import comment_above, open_tables
+from dropo_torch.data.formats import open_tables
 from dropo_torch.data.readers import matching_paths
 from dropo_torch.data.streams import TIME
 from dropo_torch.data.tables import Choice, Table, missing, numbers
+from dropo_torch.data.text import TEXT, find_separator, first_lines
 from dropo_torch.errors import InputError
 from dropo_torch.proposal.words import Words, actual, body_rates, by_family, desired, read_name
-from dropo_torch.support.given import MOST_TEXT
 
 if TYPE_CHECKING:
     from dropo_torch.proposal.angles import Angles
@@ -224,19 +224,11 @@ def _interpolated(column: Column, time: np.ndarray, at: np.ndarray) -> Column:
 
 
 def _separator(path: Path) -> str | None:
-    """What separates the columns of a text file whose header has no comma: a mark, blanks, or ``None`` for neither."""
-    if path.suffix.lower() not in (".csv", ".txt") or not path.is_file():
+    """What separates the columns of a text file, where it is not what readers expect; ``None`` where it is."""
+    if not path.name.lower().endswith(TEXT) or not path.is_file():
         return None
-    skipped, comment = comment_above(path)
-    with path.open("rb") as file:
-        lines = [file.readline(MOST_TEXT).decode("utf-8-sig", errors="replace") for _ in range(skipped + 2)]
-    first, second = lines[skipped:]
-    if comment and len(comment.split()) == len(first.split()):
-        first, second = comment, first
-    if "," in first:
-        return None
-    blanks = len(first.split()) == len(second.split()) > 1
-    return next((mark for mark in (";", "\t") if mark in first), " " if blanks else None)
+    found = find_separator(first_lines(path))
+    return None if found == ("\t" if ".tsv" in path.suffixes else ",") else found
 
 
 def _of_table(table: Table) -> list[Column]:
