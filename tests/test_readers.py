@@ -95,6 +95,16 @@ def write_savetxt(folder: Path):
     return folder / "log.txt", {**COLUMNS, "separator": " "}
 
 
+def write_packed_text(folder: Path):
+    frame().to_csv(folder / "log.dat.gz", index=False, sep="\t")
+    return folder / "log.dat.gz", {**COLUMNS, "separator": "\t"}
+
+
+def write_json_lines(folder: Path):
+    frame().to_json(folder / "log.jsonl", orient="records", lines=True, double_precision=15)
+    return folder / "log.jsonl", COLUMNS
+
+
 def write_commented_csv(folder: Path):
     frame().to_csv(folder / "log.csv", index=False)
     (folder / "log.csv").write_text("% exported\n" + (folder / "log.csv").read_text())

@@ -218,12 +218,17 @@ def _named(above: Sequence[Sequence[str]]) -> list[str]:
     rest = [row for row in above if row is not units]
     if not rest:
         return []
-    own = next((row for row in reversed(rest) if len(set(row)) == len(row) and not any(map(_is_value, row))), None)
+    own = next((row for row in reversed(rest) if all(row[:-1]) and _are_apart(row)), None)
     names = list(own or _joined(rest))
     if units is not None:
         told = [unit.strip("[]()") if _UNIT.fullmatch(unit) else "" for unit in units]
         names = [f"{n} ({u})" if u and n and f"({u})" not in n else n for n, u in zip(names, told, strict=True)]
     return names
+
+
+def _are_apart(row: Sequence[str]) -> bool:
+    """Whether the cells of a line all differ, and none is a number."""
+    return len(set(row)) == len(row) and not any(map(_is_value, row))
 
 
 def _joined(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,6 +23,8 @@ FASTEST, SLOWEST = 1.5e-4, 0.6
 GAP, SHORT_GAP, MOST, PIECE = 12.0, 3.5, 0.7, 40
 #: Seconds of a nanosecond.
 NANO = 1e-9
+#: How dates and times of day begin.
+_DATED = re.compile(r"\s*(\d{4}-\d\d-\d\d[T ]?|\d{1,2}:\d\d:\d\d)")
 #: Relative deviation of a spacing up to which stamps count as even; and spacing from which on a row is missing.
 EVEN, MISSING = 0.05, 1.5
 
@@ -188,7 +191,7 @@ def _stamps(column: Column) -> np.ndarray:
 
 def _time_column(columns: Columns, known: np.ndarray) -> Column | None:
     """The column of time stamps: by its name, or as the only one that rises evenly."""
-    called = [c for c in columns.columns if c.words.role == "time"]
+    called = [c for c in columns.columns if c.words.role == "time" or split(c.entry)[-1:] == ["time"]]
     named = [c for c in called if _rises(c, known)]
     for c in () if named else called:
         if c.values.size and _rises(replace(c, values=-c.values), known):
@@ -198,6 +201,9 @@ def _time_column(columns: Columns, known: np.ndarray) -> Column | None:
     named = named or [c for c in columns.numeric if not c.words.role and _by_unit(c) and _rises(c, known)]
     if named:
         return max(named, key=lambda c: _steps(_stamps(c)))
+    dates = [c for c in columns.columns if not c.values.size and len(c.labels) and _DATED.match(str(c.labels[0]))]
+    if dates:
+        return dates[0]
     rising = [c for c in columns.numeric if not c.words.role and _rises(c, known) and _evenly(c.values, known)]
     return rising[0] if len(rising) == 1 else None
 
@@ -208,12 +214,9 @@ def _by_unit(column: Column) -> bool:
 
 
 def _with_seconds(columns: Columns, fine: Column) -> tuple[Column, Column] | None:
-    """A column of whole seconds and the one of their nanoseconds, as a message's header has them; ``None`` without."""
-    if (
-        time_unit(fine.entry) != NANO
-        or not fine.values.size
-        or not (fine.values.min() >= 0 and np.ptp(fine.values) < 1e9)
-    ):
+    """A column of whole seconds and the one of their parts, as a message's header has them; ``None`` without."""
+    unit = time_unit(fine.entry) or 1.0
+    if unit == 1.0 or not fine.values.size or not (fine.values.min() >= 0 and np.ptp(fine.values) < 1 / unit):
         return None
     own = [word for word in split(fine.entry) if word not in TIME_UNITS]
     for c in columns.numeric:
@@ -225,8 +228,8 @@ def _with_seconds(columns: Columns, fine: Column) -> tuple[Column, Column] | Non
 
 
 def _sum(seconds: Column, fine: Column) -> Column:
-    """A column of nanoseconds since the first whole second."""
-    values = (seconds.values - seconds.values[0]) / NANO + fine.values
+    """A column of time since the first whole second, in the unit of the finer one."""
+    values = (seconds.values - seconds.values[0]) / (time_unit(fine.entry) or NANO) + fine.values
     return replace(fine, values=values, labels=values)
 
 

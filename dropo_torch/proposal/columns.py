@@ -32,6 +32,9 @@ ALIKE = 0.5
 STATES = ("observations", "observation", "obs", "state", "states")
 ACTIONS = ("actions", "action", "ctrl", "control", "controls", "u", "commands")
 
+#: A name with a number at its end.
+_NUMBERED = re.compile(r"(.*?[A-Za-z_])\[?(\d+)\]?")
+
 
 @dataclass(frozen=True)
 class Column:
@@ -167,9 +170,31 @@ def _understood(columns: Sequence[Column], known: Sequence[str]) -> list[Column]
             return False
         return bool(np.corrcoef(one[known], other[known])[0, 1] > ALIKE)
 
+    names = of_joints(columns, names)
     names = by_family(body_rates(desired(names, alike), known), known)
     names = actual(names, [read_name(name, known) for name in names])
     return [replace(c, words=read_name(name, known)) for c, name in zip(columns, names, strict=True)]
+
+
+def of_joints(columns: Sequence[Column], names: Sequence[str]) -> list[str]:
+    """Return names in which numbers are those joints that a log's own columns of text name: ``name0``, ``name[0]``.
+
+    Args:
+        columns: the columns.
+        names: their names.
+    """
+    told: dict[tuple[str, str], str] = {}
+    for c in columns:
+        found = _NUMBERED.fullmatch(c.entry)
+        if found and not c.values.size and last_part(found[1]).endswith("name") and len(set(c.labels.tolist())) == 1:
+            told[found[1][: -len("name")], found[2]] = str(c.labels[0])
+    out = list(names)
+    for i, c in enumerate(columns):
+        found = _NUMBERED.fullmatch(c.entry)
+        stem = next((s for s, number in told if found and found[2] == number and found[1].startswith(s)), None)
+        if found is not None and stem is not None and c.values.size:
+            out[i] = f"{found[1]} {told[stem, found[2]]}"
+    return out
 
 
 def _read(paths: tuple[Path, ...], tables: list[Table], separator: str | None) -> Columns:

@@ -16,8 +16,10 @@ from dropo_torch.proposal.matches import Match, Matching, Sureness, is_taken, or
 from dropo_torch.proposal.motions import LIKE, SAME, SPANS, motion, turning
 from dropo_torch.proposal.places import Place
 from dropo_torch.proposal.units import with_unit
-from dropo_torch.proposal.words import Words
+from dropo_torch.proposal.words import Words, split
 
+#: Score by which what is told of a motor gives way to what is told of its joint, and words of motors.
+MOTORS, _MOTOR = 1e-3, frozenset(("motor", "motors", "rotor", "mot"))
 #: Score below which a column is not taken for a place, and above which its name leaves no doubt.
 LEAST, SURE = 0.3, 0.75
 #: What a name loses by each word that is none of the place's, and a column by never moving: of two with the joint's
@@ -149,6 +151,7 @@ def _assigned(
                 if _is_partial(words[c.entry], p, names[i, j]) and _refuted(p, c, found, starts):
                     names[i, j] = scores[i, j] = -2.0
             scores[i, j] += _role_bonus(words[c.entry], p) - 1e-6 * j - 1e-7 * abs(i - j)  # else in order
+            scores[i, j] -= MOTORS * bool(_MOTOR & {*split(c.entry)}) * (p.kind in ("position", "velocity"))
             scores[i, j] -= FOREIGN * len(set(words[c.entry].objects) - {*p.words, *p.aliases}) + STILL * (not c.moves)
     rows, columns = linear_sum_assignment(np.where(scores < -1, -10.0, scores), maximize=True)
     matches = []

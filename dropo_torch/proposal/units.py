@@ -95,7 +95,7 @@ def _by_range(place: Place, values: np.ndarray) -> float:
     others = [s for s in (ANGLES if place.measure == "angle" else LENGTHS) if s != 1.0 and s != math.pi / 30]
     if inside(1.0) > 0.8:
         return 1.0
-    return next((s for s in others if inside(s) > 0.95), 1.0)
+    return max((s for s in others if inside(s) > 0.95), default=1.0)  # the one that fills the range best
 
 
 def with_velocity_units(matching: Matching, starts: np.ndarray, dt: float) -> Matching:

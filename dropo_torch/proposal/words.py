@@ -62,7 +62,21 @@ UNITS: dict[str, float] = {
     "dps": math.pi / 180, "degps": math.pi / 180, "radps": 1.0, "rpm": math.pi / 30, "rad": 1.0, "rads": 1.0,
     "radian": 1.0, "radians": 1.0, "mrad": 1e-3, "mm": 1e-3,
     "mmps": 1e-3, "cm": 1e-2, "meter": 1.0, "meters": 1.0, "nm": 1.0, "newton": 1.0, "mnm": 1e-3,
+    "um": 1e-6, "inch": 0.0254, "revs": math.tau, "revps": math.tau, "ncm": 1e-2, "knm": 1e3, "kilonewton": 1e3,
 }  # fmt: skip
+#: Units as people write them, where marks and capitals tell what they are, and as words of :data:`UNITS`.
+_WRITTEN = tuple(
+    (re.compile(pattern), f" {word} ")
+    for pattern, word in (
+        (r"[°º˚]\s*/\s*s(ec)?(?![A-Za-z²])", "dps"), (r"[°º˚](?!\s*[CF])", "deg"),
+        (r"(?<![A-Za-z])mN\s?[·*.]?\s?m(?![A-Za-z])", "mnm"), (r"(?<![A-Za-z])N\s?[·*.]?\s?cm(?![A-Za-z])", "ncm"),
+        (r"(?<![A-Za-z])kN\s?[·*.]?\s?m(?![A-Za-z])", "knm"), (r"(?<![A-Za-z])kN(?![A-Za-z])", "kilonewton"),
+        (r"(?<![A-Za-z])N\s?[·*.]\s?m(?![A-Za-z])", "nm"), (r"[µμ]m(?![A-Za-z])", "um"), (r"[µμ]s(?![A-Za-z])", "us"),
+        (r"(?<![A-Za-z])(revs?|turns?|rot)\s?/\s?s(ec)?(?![A-Za-z])|(?<![A-Za-z])rps(?![A-Za-z])", "revps"),
+        (r"[\[(]\s*(revs?|turns?|rot)\s*[\])]|(?<=[_ ])(revs|turns)$", "revs"), (r"[\[(]\s*N m\s*[\])]", "nm"),
+        (r"[\[(]\s*(in|inch|inches)\s*[\])]", "inch"),
+    )
+)  # fmt: skip
 #: Words of hundredths of a range, and of what is so commanded.
 _PERCENT, _OPENS = _set("pct percent perc"), _set("valve spool pump")
 #: Of commands the actuator's, of measurements that they are actual ones.
@@ -70,12 +84,17 @@ _ACT = "act"
 #: Units that count only as a name's last word: they are letters with other meanings, too.
 _LAST = {"m": 1.0, "s": 1.0, "n": 1.0, "mps": 1.0}
 #: Units of velocities, of efforts, and of which names do not tell; others are of positions.
-_RATES, _EFFORTS, _EITHER = _set("dps degps radps rpm mmps mps"), _set("nm mnm newton n"), _set("degs rads s")
+_RATES, _EFFORTS, _EITHER = (
+    _set("dps degps radps rpm revps mmps mps"),
+    _set("nm mnm ncm knm kilonewton newton n"),
+    _set("degs rads s"),
+)
 #: Units of time stamps → seconds.
 TIME_UNITS = {
-    "s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "millis": 1e-3,
-    "milliseconds": 1e-3, "us": 1e-6, "usec": 1e-6, "micros": 1e-6, "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9,
-    "nanos": 1e-9, "nanoseconds": 1e-9, "nanosec": 1e-9,
+    "s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "msecs": 1e-3,
+    "millis": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "usec": 1e-6, "usecs": 1e-6, "micros": 1e-6,
+    "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9, "nsecs": 1e-9, "nanosec": 1e-9, "nanosecs": 1e-9, "nanos": 1e-9,
+    "nanoseconds": 1e-9,
 }  # fmt: skip
 #: Words of what an encoder counts: how many make a turn or a meter, no name tells.
 COUNTS = _set("tick ticks counts cnts pulses lsb")
@@ -126,6 +145,8 @@ class Words:
 
 def split(name: str) -> list[str]:
     """Return the words and numbers of a name in small letters: at marks, capitals and digits."""
+    for pattern, word in _WRITTEN:
+        name = pattern.sub(word, name)
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
     return re.findall(r"[a-z]+|\d+", spaced.lower())
 
