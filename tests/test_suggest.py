@@ -121,10 +121,31 @@ def test_where_nothing_is_commanded_motions_start_faster() -> None:
     assert set(found) == set(STARTS)
     fast, logged = found["motions that start twice as fast"], passive.evidence.windows
     for i in range(0, len(fast), IN_A_ROW):
-        (own,) = np.flatnonzero((logged.episodes == fast.episodes[i]) & (logged.steps == fast.steps[i]))
-        np.testing.assert_allclose(fast.measured[i, 0], logged.measured[own, 0] * [1, 2])
+        assert np.isclose(logged.measured[:, 0] * [1, 2], fast.measured[i, 0], rtol=1e-12).all(1).sum() == 1
     idle = recorded(size=0.0)  # a motor that is off
     assert set(dict(motions(idle.evidence, Hypothesis(())))) == set(STARTS)
+
+
+@pytest.mark.parametrize(
+    ("effect", "numbers", "actuators"),
+    [
+        ("joint_presliding", (0.1, 0.003), MOTOR), ("joint_presliding", (0.01, 0.003), ""),
+        ("joint_elasticity", (0.01, 0.3, 0.02), MOTOR),
+    ],
+)  # fmt: skip
+def test_a_motion_goes_on_where_forces_remember(effect: str, numbers: tuple[float, ...], actuators: str) -> None:
+    """What is remembered at a window's start is what the motion before has left."""
+    evidence = recorded(actuators=actuators).evidence
+    true = Hypothesis((), (Placed(VOCABULARY[effect], "pivot", numbers),))
+    errors = []
+    for words, windows in motions(evidence, true):
+        if words != "the same motion again":
+            later = windows.select(np.arange(len(windows)) % IN_A_ROW > 0)
+            for own in (later, replace(later, observed=None)):
+                shown = evidence.twin.predict([true.variant], own)[0][0]
+                errors.append(np.abs(shown - later.measured).max())
+    begun, anew = np.reshape(errors, (-1, 2)).max(0)
+    assert begun < 0.3 * anew
 
 
 def test_a_motion_goes_on_as_it_would_be() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import spread
-from dropo_torch.gap.refit import LEAST_DAMPING, RIDGE, STEP, Hypothesis, Refit, beside, limits_of, refit
+from dropo_torch.gap.refit import LEAST_DAMPING, RIDGE, STEP, Hypothesis, Refit, beside, derivatives, limits_of, refit
 from dropo_torch.gap.rules import near
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.optimizers.least_squares import bounded_step
@@ -128,13 +128,13 @@ def separation(motion: Evidence, true: Hypothesis, rival: Refit, share: float = 
     vector, least = start, np.inf
     for _ in range(ADAPTED):
         there = rival.hypothesis.at(vector)
-        moved, steps = beside(there, limits, free, STEP)
+        moved, along = beside(there, limits, free, STEP)
         found = motion.residuals([there.variant, *(h.variant for h in moved)])[0]
         if not (np.isfinite(found).all() and np.isfinite(shown).all()):
             return None if least == np.inf else float(np.sqrt(least))
         apart = motion.project_slope(found[0] - shown, linear).ravel()
         slope = np.zeros((len(vector), apart.size))
-        moves = motion.project_slope((found[1:] - found[0]) / steps[:, None, None], linear)
+        moves = motion.project_slope(derivatives(found[1:] - found[0], along), linear)
         slope[free] = moves.reshape(len(free), apart.size)
         change = (vector - start) / limits.scale
         least = min(least, float(apart @ apart + change @ cost @ change))
@@ -196,14 +196,34 @@ def _commanded(begins: Windows, setting: Setting, vary: Callable[[np.ndarray], n
     if model.nactuator == model.nu:
         limited = model.actuator_ctrllimited.astype(bool)
         commands = np.where(limited, np.clip(commands, *model.actuator_ctrlrange.T), commands)
-    return replace(begins, commands=np.ascontiguousarray(commands), episodes=np.arange(len(begins)))
+    return replace(_apart(begins), commands=np.ascontiguousarray(commands))
 
 
 def _faster(begins: Windows, setting: Setting, factor: float) -> Windows:
-    """The same starts with velocities so many times as large."""
-    measured = begins.measured.copy()
+    """The same starts with velocities so many times as large, before which nothing was."""
+    measured, apart = begins.measured.copy(), _apart(begins)
     measured[:, 0, setting.observation.index >= setting.model.nq] *= factor
-    return replace(begins, measured=measured, rates=factor * begins.rates, starts=None)
+    begun = replace(apart, measured=measured, rates=factor * begins.rates, starts=None)
+    nothing = None if apart.observed is None else np.full_like(apart.observed, np.nan)
+    return replace(begun, observed=_gone_on(replace(begun, observed=nothing), measured[:, :1]))
+
+
+def _apart(begins: Windows) -> Windows:
+    """The same starts, each with an episode of its own."""
+    observed = None if begins.observed is None else begins.observed[begins.episodes]
+    return replace(
+        begins, episodes=np.arange(len(begins)), commands=begins.commands[begins.episodes], observed=observed
+    )
+
+
+def _gone_on(begins: Windows, shown: np.ndarray) -> np.ndarray | None:
+    """What is observed of every episode ``(E, N, n)`` that goes on along a path ``(E, P, n)`` from its start."""
+    if begins.observed is None:
+        return None
+    observed = begins.observed.copy()
+    for own, step, path in zip(observed, begins.steps, shown, strict=True):
+        own[step : step + len(path)] = path[: len(own) - step]
+    return observed
 
 
 def _played(twin: Twin, true: Hypothesis, begins: Windows, row: int) -> Windows:
@@ -221,5 +241,6 @@ def _played(twin: Twin, true: Hypothesis, begins: Windows, row: int) -> Windows:
         steps=(begins.steps[:, None] + at).ravel(),
         commands=begins.commands,
         unseen=begins.unseen,
+        observed=_gone_on(begins, shown),
     )
     return cut.select(np.isfinite(shown).all((1, 2)).repeat(row))
