@@ -204,6 +204,30 @@ def test_rates_of_roll_pitch_and_yaw_are_body_rates(name: str) -> None:
     assert body_rates(names, ["yaw_joint"]) == names
 
 
+def test_columns_of_text_say_of_which_joints_numbered_ones_are(tmp_path: Path) -> None:
+    """Joints in another order than the model's, as a message with their names has them."""
+    told = ["elbow", "base_yaw", "shoulder"]
+    frame = swung([f"field.position{i}" for i in range(3)])
+    named = {f"field.name{i}": np.full(200, joint) for i, joint in enumerate(told)}
+    found = matched(tmp_path, frame | named)
+    assert [found[f"{joint}.position"] for joint in told] == list(frame)
+
+
+def test_of_a_motors_angle_and_its_joints_the_joints_counts(tmp_path: Path) -> None:
+    frame = swung([f"{side}_{joint}_pos" for side in ("motor", "link") for joint in ("base_yaw", "shoulder", "elbow")])
+    found = matched(tmp_path, frame)
+    assert [found[f"{joint}.position"] for joint in ("shoulder", "elbow")] == ["link_shoulder_pos", "link_elbow_pos"]
+
+
+def test_seconds_and_their_parts_are_one_clock_in_any_unit(tmp_path: Path) -> None:
+    stamps = 5_000_000 + 20_000 * np.arange(200)
+    frame = {"tv_sec": stamps // 10**6, "tv_usec": stamps % 10**6, **swung(["elbow"])}
+    pd.DataFrame(frame).to_csv(tmp_path / "log.csv", index=False)
+    clock = find_clock(read_columns(tmp_path / "log.csv"), 0.01)
+    assert clock.dt == pytest.approx(0.02)
+    assert not clock.breaks
+
+
 def test_a_family_may_be_called_after_what_measures_it() -> None:
     joints = ["sled", "sled_x", "sled_y", "sled_yaw", "table"]
     assert by_family(["t", "cam_x_mm", "cam_y_mm", "cam_yaw_mrad"], joints)[1:] == [
