@@ -1114,6 +1114,28 @@ def test_roll_pitch_and_yaw_are_the_orientation_of_a_free_body(
     assert np.median(wrong.magnitude()) < 0.02
 
 
+@pytest.mark.parametrize("wrong", ["linear", "angular", "neither"])
+def test_velocities_along_other_axes_are_not_taken_for_the_models(wrong: str, tmp_path: Path) -> None:
+    """An odometry's twist is in the body's frame, and a motion capture's angular velocity in the world's."""
+    t, q, v, u = floated()
+    turns, names = (
+        Rotation.from_quat(q[:, 3:], scalar_first=True),
+        [f"{a}.{b}" for a in ("linear", "angular") for b in "xyz"],
+    )
+    frame = {"t": t} | dict(zip(("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"), q.T, strict=True))
+    told = np.hstack([
+        turns.inv().apply(v[:, :3]) if wrong == "linear" else v[:, :3],
+        turns.apply(v[:, 3:]) if wrong == "angular" else v[:, 3:],
+    ]) + 1e-3 * np.random.default_rng(3).standard_normal((len(t), 6))  # fmt: skip
+    frame |= {f"twist.{name}": column for name, column in zip(names, told.T, strict=True)}
+    frame |= {"surge_cmd": u[:, 0], "turn_cmd": u[:, 1]}
+    found = dropo.propose_config(*written(tmp_path, frame, FLOATING), out=tmp_path / "robot.yaml")
+    label = {m.column.entry: m.place.label for m in found.matching.matches}
+    own = {f"twist.{name}": f"hull_free.velocity[{'v' if name[0] == 'l' else 'w'}{name[-1]}]" for name in names}
+    assert {c: p for c, p in label.items() if c in own} == {c: p for c, p in own.items() if wrong not in c}
+    assert ("along other axes than the model's" in " ".join(found.draft.notes)) == (wrong != "neither")
+
+
 def rates_of(read: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([read[f"hull_free.velocity[w{axis}]"] for axis in "xyz"], axis=1)
 

@@ -24,6 +24,10 @@ HEADS = {
     "names in several lines": (
         ",", "Rate,120.0\n\n,Body,Body\n,Rotation,Position\nTime,X,X\n", ["Time", "Rotation X", "Position X"],
     ),
+    "the unit of lengths": (
+        ",", "Length Units,Millimeters,Rotation Type,XYZ\n\n,Box,Box\n,Rotation,Position\nt,X,X\n",
+        ["t", "Rotation X", "Position X (mm)"],
+    ),
     "a comment": (" ", "# of May 3\n# t q u\n", ["t", "q", "u"]),
     "a comment above names": (",", "% exported\nt,q,u\n", ["t", "q", "u"]),
     "an empty line": (",", "\nt,q,u\n", ["t", "q", "u"]),

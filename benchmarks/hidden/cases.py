@@ -58,6 +58,7 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     "joint_friction": _JOINTS,
     "joint_stribeck": _JOINTS,
     "joint_presliding": _JOINTS,
+    "joint_lugre": _JOINTS,
     "joint_load_friction": {"torque_arm": _ARM, "servo_arm": _SERVO[:2], "cart_pole": ("rail",), "furuta": ("turn",)},
     "joint_elasticity": {"torque_arm": _ARM, "servo_arm": _SERVO[:2], "cart_pole": ("rail",), "furuta": ("turn",)},
     "joint_stiffness": {**_JOINTS, "hopper": _LEG},
@@ -430,6 +431,13 @@ def _presliding(t: float, _v: float, _i: float, rng: np.random.Generator) -> Dra
     return lambda s: {"coulomb": 0.5 * s * t, "displacement": displacement}
 
 
+def _lugre(t: float, v: float, _i: float, rng: np.random.Generator) -> Draw:
+    displacement, ratio, knee = 10 ** rng.uniform(-2.5, -1.5), rng.uniform(1.5, 2.2), rng.uniform(0.05, 0.15) * v
+    return lambda s: {
+        "coulomb": 0.4 * s * t, "displacement": displacement, "static": 0.4 * s * t * ratio, "velocity": knee,
+    }  # fmt: skip
+
+
 def _cogging(t: float, v: float, _i: float, rng: np.random.Generator) -> Draw:
     poles, phase = int(rng.integers(4, 15)), rng.uniform(-np.pi, np.pi)
     return lambda s: {"amplitude": 0.5 * s * t, "poles": poles, "phase": phase}
@@ -598,6 +606,7 @@ DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
     "joint_friction": _joint_draw(lambda t, v, i, r: lambda s: {"friction": 0.4 * s * t}),
     "joint_stribeck": _joint_draw(_stribeck),
     "joint_presliding": _joint_draw(_presliding),
+    "joint_lugre": _joint_draw(_lugre),
     "joint_load_friction": _joint_draw(lambda t, v, i, r: lambda s: {"coefficient": 0.6 * s}),
     "joint_elasticity": _joint_draw(_elasticity),
     "joint_stiffness": _joint_draw(_stiffness),

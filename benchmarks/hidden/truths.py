@@ -280,7 +280,7 @@ def _load_friction(plant: Plant, joint: str, coefficient: float) -> Force:
 
 
 #: Steps of a rotor in a fine step.
-_ROTOR_STEPS = 8
+_ROTOR_STEPS, _BRISTLE_STEPS = 8, 8
 
 
 def _elasticity(plant: Plant, joint: str, stiffness: float, damping: float, inertia: float) -> Force:
@@ -328,6 +328,24 @@ def _presliding(plant: Plant, joint: str, coulomb: float, displacement: float) -
     return force
 
 
+def _lugre(plant: Plant, joint: str, coulomb: float, displacement: float, static: float, velocity: float) -> Force:
+    """LuGre friction without bristle damping: the deflection of the bristles, in meters or radians, by Euler steps."""
+    i, stiffness, level = plant.dof(joint), coulomb / displacement, _stribeck_level(coulomb, static, velocity)
+    memory = {"z": 0.0}
+
+    def forget() -> None:
+        memory["z"] = 0.0
+
+    def force(p: Plant) -> None:
+        v, before = float(p.middle_v[i]), memory["z"]
+        for _ in range(_BRISTLE_STEPS):
+            memory["z"] += p.h / _BRISTLE_STEPS * (v - stiffness * abs(v) / level(0.0, v) * memory["z"])
+        p.force[i] -= 0.5 * stiffness * (before + memory["z"])
+
+    plant.memories.append(forget)
+    return force
+
+
 def _stribeck_level(coulomb: float, static: float, velocity: float) -> Callable[[float, float], float]:
     return lambda _q, speed: coulomb + (static - coulomb) * math.exp(-((speed / velocity) ** 2))
 
@@ -344,6 +362,7 @@ JOINT_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = {
     "joint_stribeck": lambda p, j, x: _dry_friction(p, j, _stribeck_level(x["coulomb"], x["static"], x["velocity"])),
     "joint_load_friction": lambda p, j, x: _load_friction(p, j, x["coefficient"]),
     "joint_presliding": lambda p, j, x: _presliding(p, j, x["coulomb"], x["displacement"]),
+    "joint_lugre": lambda p, j, x: _lugre(p, j, x["coulomb"], x["displacement"], x["static"], x["velocity"]),
     "joint_elasticity": lambda p, j, x: _elasticity(p, j, 1 / x["compliance"], x["damping"], x["inertia"]),
     "joint_coupling": lambda p, j, x: _coupling(p, j, x["stiffness"]),
 }

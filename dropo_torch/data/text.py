@@ -56,6 +56,14 @@ _UNIT = re.compile(
     r"counts?|ticks)([/·*]?(s|sec|min|s\^?2|s²))?[\])]?"
 )
 _UNITS = ("unit", "units", "einheit", "einheiten")
+#: Where what was recorded says in which unit lengths are, as exports of motion capture do; the words for these.
+_LENGTHS = re.compile(r"\b(?:length|position|distance|translation)\s*units?\b[\s,;:=\"]*([A-Za-z]+)", re.IGNORECASE)
+_LENGTH_WORDS = {
+    "mm": "mm", "millimeter": "mm", "millimetre": "mm", "cm": "cm", "centimeter": "cm", "centimetre": "cm", "m": "m",
+    "meter": "m", "metre": "m", "inch": "inch", "inches": "inch",
+}  # fmt: skip
+#: Names of lengths along an axis.
+_LENGTH = re.compile(r"(?:.*[\W_])?(?:pos|position|translation|location)[\W_]*(?:.*[\W_])?[XYZ]", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -157,7 +165,7 @@ def find_head(lines: Sequence[str], separator: str) -> Head:
         above = [row for row in bare if len(row) == width][-1:]
     if not above and told:
         above = [rows[told[-1]]]  # of another number of columns than the rows, as reading them will tell
-    return Head(first, tuple(_named(above)), width)
+    return Head(first, tuple(_in_lengths(_named(above), lines[:first])), width)
 
 
 def _last_block(rows: Sequence[Sequence[str]], widths: Sequence[int]) -> list[list[str]]:
@@ -224,6 +232,16 @@ def _named(above: Sequence[Sequence[str]]) -> list[str]:
         told = [unit.strip("[]()") if _UNIT.fullmatch(unit) else "" for unit in units]
         names = [f"{n} ({u})" if u and n and f"({u})" not in n else n for n, u in zip(names, told, strict=True)]
     return names
+
+
+def _in_lengths(names: Sequence[str], lines: Sequence[str]) -> list[str]:
+    """Names with the unit of lengths that lines above them tell, at those of positions along an axis."""
+    told = [found[1].lower() for line in lines for found in [_LENGTHS.search(line)] if found]
+    units = {_LENGTH_WORDS.get(word) or _LENGTH_WORDS.get(word.removesuffix("s")) for word in told} - {None}
+    if len(units) != 1:
+        return list(names)
+    (unit,) = units
+    return [f"{name} ({unit})" if _LENGTH.fullmatch(name) else name for name in names]
 
 
 def _are_apart(row: Sequence[str]) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 
 from dropo_torch.data.features import Features
 from dropo_torch.effects.engine import Variant
+from dropo_torch.gap.apart import Limbs
 from dropo_torch.gap.rules import Rules, Weighed
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.support.rows import evenly
@@ -175,8 +176,24 @@ class Evidence:
         easy = own.eased(setting)
         if easy != own or near.twin is not self.twin:
             at = near.residuals([easy])[0][0]
-        found, _ = near.residuals([v.eased(setting) for v in others], moved, pushes)
-        return found - at
+        return near.beside(easy, at, [v.eased(setting) for v in others], moved, pushes) - at
+
+    def beside(
+        self, own: Variant, at: np.ndarray, others: Sequence[Variant], moved: np.ndarray | None = None,
+        pushes: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Return residuals of hypotheses ``(K, W, N)`` near one, several at once where these change different limbs.
+
+        Args:
+            own: the one that is near.
+            at: its residuals, ``(W, N)``.
+            others: the hypotheses, K of them, with
+            moved, pushes: see :meth:`residuals`.
+        """
+        limbs = None if pushes is not None else Limbs.of(self.twin.setting, self.chart, self.twin.effects(own))
+        if limbs is None:
+            return self.residuals(others, moved, pushes)[0]
+        return limbs.residuals(own, at, others, moved, lambda some, starts: self.residuals(some, starts)[0])
 
     def linearize(self, variant: Variant) -> Linearization:
         """Return how a hypothesis' residuals depend on the initial states."""

@@ -324,6 +324,7 @@ class Rules:
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
         misjudged: share that few numbers may leave where it is no more than ``sound.rest``: so much may be wrong with
             the estimate of the noise.
+        own_step: likewise where all that is named is the model's own step, and what it leaves no more than noise.
         free: numbers of the named effects beyond which each halves what they may leave, for many numbers together
             imitate what none of them is; what they leave must be less than ``sound.wrong`` then.
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends;
@@ -338,6 +339,7 @@ class Rules:
     most: float = 0.8
     accounted: float = 0.95
     misjudged: float = 0.1
+    own_step: float = 0.3
     free: int = 3
     hopeless: float = 0.8
     imitating: float = 0.5
@@ -391,6 +393,8 @@ def may_leave(named: Refit, rules: Rules) -> float:
     """Return the share of the first excess that a fit may leave; more of it where the noise may be misjudged."""
     most = allowance(named.hypothesis, rules)
     small = not beyond_free(named.hypothesis, rules) and not remains(named.cost, rules)
+    if all(p.effect.steps for p in named.hypothesis.placed) and not significant(named.cost, rules):
+        return rules.own_step  # the step that a simulator has claims nothing of the robot
     return max(most, rules.misjudged) if small else most
 
 

@@ -90,7 +90,7 @@ class Focus:
         """
         own = self.fitted.hypothesis
         if not any(p.effect.steps for p in own.placed):
-            return self.evidence.residuals(variants)[0]
+            return self.evidence.beside(own.variant, self.simulated, variants)
         return self.simulated + self.evidence.changes(own.variant, self.simulated, variants)
 
 

@@ -221,6 +221,8 @@ def _lost(matching: Matching) -> list[str]:
     told = {
         "the motion tells accelerations": [c for c in matching.unused if c.words.role == "acceleration"],
         "commands are known": [c for c in matching.unused if c.words.role == "effort" and matching.of("command")],
+        "they are along other axes than the model's: a free body's velocity is along the world's, its turning about "
+        "the body's": list(matching.otherwise),
     }
     told["nothing of the model is called so"] = [
         c for c in matching.unused if not any(c is other for group in told.values() for other in group)

@@ -49,7 +49,7 @@ def _with(matching: Matching, found: Sequence[Match]) -> Matching:
     used, labels = [m.column for m in found], {m.place.label for m in found}
     unused = tuple(c for c in matching.unused if all(c is not u for u in used))
     missing = tuple(p for p in matching.missing if p.label not in labels)
-    return Matching((*matching.matches, *found), missing, unused)
+    return replace(matching, matches=(*matching.matches, *found), missing=missing, unused=unused)
 
 
 def _with_gyroscope(matching: Matching, base: Base, places: Sequence[Place]) -> Matching:

@@ -76,11 +76,13 @@ class Matching:
         matches: what was matched, in the model's order: positions, velocities, commands.
         missing: places without a column.
         unused: columns of numbers that move and are none of the model's.
+        otherwise: those of them that are velocities of a free body along other axes than the model has them.
     """
 
     matches: tuple[Match, ...]
     missing: tuple[Place, ...]
     unused: tuple[Column, ...]
+    otherwise: tuple[Column, ...] = ()
 
     def of(self, kind: str) -> tuple[Match, ...]:
         """Return the matches of a kind, in the model's order."""

@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns
 from dropo_torch.proposal.drives import behind_efforts, is_state, may_command, namesakes, numbered_drives
 from dropo_torch.proposal.matches import Match, Matching, Sureness, is_taken, orientation
-from dropo_torch.proposal.motions import LIKE, SAME, SPANS, motion, turning
+from dropo_torch.proposal.motions import LIKE, SAME, SPANS, motion, told_otherwise, turning
 from dropo_torch.proposal.places import Place
 from dropo_torch.proposal.units import with_unit
 from dropo_torch.proposal.words import Words, split
@@ -56,10 +56,11 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
     if driven and not driven & found.keys():  # what is called after drives may be all that is measured of their joints
         other = _found(places, free, known, starts)
         found = other if driven & other.keys() else found
+    found, others = _along_own_axes(places, found, starts)
     matches = tuple(with_unit(found[p.label], found) for p in places if p.label in found)
     used = [m.column for m in matches] + list(taken)
     unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used) and not _counts(c, starts))
-    return Matching(matches, tuple(p for p in places if p.label not in found), unused)
+    return Matching(matches, tuple(p for p in places if p.label not in found), unused, others)
 
 
 def _found(
@@ -73,6 +74,7 @@ def _found(
         found |= {m.place.label: m for m in fits}
         if kind == "command":
             found |= {m.place.label: m for m in namesakes(places, free, found)}
+        found = _without_parts(places, free, found) if kind == "velocity" else found
         ordered = _by_family(places, kind, free, found)
         found |= {m.place.label: m for m in ordered if not _refuted(m.place, m.column, found, starts)}
     found |= {m.place.label: m for m in _in_order(places, free, found)}
@@ -80,6 +82,55 @@ def _found(
     found |= {m.place.label: m for m in numbered_drives(places, free, found)}
     found |= {m.place.label: m for m in behind_efforts(places, free, found)}
     return found
+
+
+def _along_own_axes(
+    places: Sequence[Place], found: Mapping[str, Match], starts: np.ndarray
+) -> tuple[dict[str, Match], tuple[Column, ...]]:
+    """What was found without free bodies' velocities along other axes than the model's, and the columns of these.
+
+    MuJoCo has a free body's velocity along the world's axes and its turning about the body's. Loggers may have either
+    the other way; what explains clearly more of the motion, turned so, is.
+    """
+    kept, others = dict(found), list[Column]()
+    for joint in {p.joint for p in places if p.measure == "quaternion"}:
+        quaternion = orientation(joint, places, found)
+        if quaternion is None:
+            continue
+        for angular in (False, True):
+            own = [found.get(p.label) for p in places if _is_rate_of(p, joint, angular=angular)]
+            path = [found.get(p.partner) for p in places if _is_rate_of(p, joint, angular=angular)]
+            if not all(own) or not (angular or all(path)):
+                continue
+            rates = np.stack([m.values for m in own if m], axis=1)
+            where = np.stack([m.values for m in path if m], axis=1) if not angular else quaternion
+            if told_otherwise(where, rates, quaternion, starts):
+                others += [m.column for m in own if m]
+                kept = {label: m for label, m in kept.items() if m not in own}
+    return kept, tuple(others)
+
+
+def _is_rate_of(place: Place, joint: int, *, angular: bool) -> bool:
+    return place.kind == "velocity" and place.joint == joint and place.angular == angular
+
+
+def _without_parts(places: Sequence[Place], free: Sequence[Column], found: Mapping[str, Match]) -> dict[str, Match]:
+    """What was found, without a free body's velocity of which only some axes move as its place changes.
+
+    A velocity in the body's own frame agrees along axes about which the body hardly turns.
+    """
+    kept = dict(found)
+    for p in places:
+        if p.kind != "velocity" or not p.axis or p.label in found:
+            continue
+        own = [m for m in found.values() if m.place.joint == p.joint and m.place.angular == p.angular]
+        own = [m for m in own if m.place.kind == "velocity"]
+        families = {(m.column.array, m.column.words.objects, m.column.words.numbers) for m in own}
+        for c in free:
+            is_own = (c.array, c.words.objects, c.words.numbers) in families and c.words.axis == p.axis
+            if is_own and c.words.role == "velocity" and c.words.angular == p.angular and not is_taken(c, found):
+                kept = {label: m for label, m in kept.items() if m not in own}
+    return kept
 
 
 def _counts(column: Column, starts: np.ndarray) -> bool:

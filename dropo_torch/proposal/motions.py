@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 #: Shares of motion that a velocity must explain to be its position's, and to be so whatever it is called.
 LIKE, SAME = 0.5, 0.9
+#: Part of what velocities leave of the motion that they must leave along other axes to be along these.
+CLEARLY = 0.5
 #: Rows over which motion is compared with velocities: noise of positions drowns it over one.
 SPANS = (1, 4, 16)
 
@@ -61,3 +64,32 @@ def motion(position: np.ndarray, velocity: np.ndarray, starts: np.ndarray) -> tu
         if share > best[0]:
             best = (share, slope)
     return best
+
+
+def told_otherwise(path: np.ndarray, rates: np.ndarray, quaternion: np.ndarray, starts: np.ndarray) -> bool:
+    """Return whether velocities of a free body are along the axes along which the model does not have them.
+
+    They explain clearly more of the motion if they are turned so.
+
+    Args:
+        path: positions ``(N, 3)``, for velocities that the model has along the world's axes; or orientations
+            ``(N, 4)``, for angular ones, which it has about the body's.
+        rates: the velocities, ``(N, 3)``.
+        quaternion: the orientations, ``(N, 4)``.
+        starts: rows at which an episode begins, ``(N,)`` bool.
+    """
+    known = (np.linalg.norm(quaternion, axis=1) > 1e-6) & np.isfinite(rates).all(1)
+    if not known.any():
+        return False
+    turns = Rotation.from_quat(quaternion[known], scalar_first=True)
+    turned, angular = rates.copy(), path.shape[1] == 4
+    turned[known] = (turns.inv() if angular else turns).apply(rates[known])
+
+    def share(told: np.ndarray) -> float:
+        if angular:
+            return turning(path, told, starts)[0]
+        begins = starts.copy()
+        begins[:1] = True
+        return motion(path.T.ravel(), told.T.ravel(), np.tile(begins, 3))[0]
+
+    return share(turned) > LIKE and 1 - share(turned) < CLEARLY * (1 - share(rates))

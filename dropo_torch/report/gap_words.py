@@ -31,6 +31,7 @@ _NOUNS = {
     "joint_stribeck": "dry friction in {0} that is larger at rest than in motion (Stribeck)",
     "joint_soft_friction": "dry (Coulomb) friction in {0} that creeps at rest",
     "joint_presliding": "dry friction in {0} that gives elastically before it slides",
+    "joint_lugre": "dry friction in {0} that gives before it slides and is larger when slow",
     "joint_friction_slope": "dry friction in {0} that changes along its range",
     "joint_load_friction": "dry friction in {0} that grows with the force that drives it",
     "joint_elasticity": "a transmission of {0} that gives (elasticity between motor and joint)",
