@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from dropo_torch.effects.base import Placed, Quantity, Setting, find_effect
@@ -12,8 +14,8 @@ from dropo_torch.effects.joint import JointEffect, JointStribeck, unit
 PAST = 0.1
 #: Seconds before a simulation from which the bristles are replayed.
 REPLAYED = 0.5
-#: Shares of the typical force, and factors of the shortest displacement that matters, from which a search begins.
-SHARES, FAR = (0.01, 0.2), (1.0, 10.0)
+#: Shares of the typical force, with factors of a displacement, from which a search begins.
+STARTS = ((0.01, 1.0), (0.2, 1.0), (0.2, 10.0))
 #: Highest frequency at which the bristles may let the joint oscillate, in radians of a physics step.
 STIFFEST = 0.5
 
@@ -43,7 +45,7 @@ class JointPresliding(JointEffect):
     """
 
     name = "joint_presliding"
-    contains = ("joint_friction", "joint_soft_friction", "joint_stribeck")
+    contains: ClassVar[tuple[str, ...]] = ("joint_friction", "joint_soft_friction", "joint_stribeck")
     sentence = "dry friction in {target} that gives elastically before it slides (presliding)"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
@@ -57,7 +59,7 @@ class JointPresliding(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         force, displacement = self.quantities(setting, target)
-        return [np.array([share * force.scale, far * displacement.neutral]) for share in SHARES for far in FAR]
+        return [np.array([share * force.scale, far * displacement.neutral]) for share, far in STARTS]
 
     def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
         if simpler.effect.name not in self.contains or simpler.values[0] <= 0:

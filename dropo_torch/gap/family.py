@@ -66,6 +66,9 @@ def with_family(ground: Ground, state: State, found: State) -> State:
         return found
     same = one_kind(found.current.hypothesis)
     kind = same or len(joints_of(ground)) == 1
+    most = rules.hopeless * rules.clearer[int(kind)]
+    if leaves_too_much(ground, state.base.hypothesis, found.current.hypothesis, most):
+        return found
     best = found if found.done or same else extend(ground, found)  # what contains the first effects may be the truth
     cost = best.current.cost
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
@@ -75,7 +78,6 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     beside = with_one_more(ground, best)
     if beside and (not significant(beside[0].cost, ground.rules) or is_of_step(ground, beside[0])):
         return replace(best, current=beside[0])
-    most = rules.hopeless * rules.clearer[int(kind)]
     if leaves_too_much(ground, state.base.hypothesis, best.current.hypothesis, most):
         return found
     fitted = fitted_family(ground, state.base.hypothesis)

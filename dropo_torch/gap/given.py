@@ -39,6 +39,8 @@ _UNFITTED = (
     "The config's parameters are as the model has them. To fit them, too, would take {} s at least, where {} s were "
     "left: --resume with a longer --time-limit does."
 )
+#: Hypotheses that are simulated to see how long that takes.
+BATCH = 8
 #: Fits of the declared parameters that a search takes as long as, at least.
 FITS = 40
 
@@ -100,7 +102,7 @@ def find_gap_as_given(
         )  # fmt: skip
 
     scene = scene or prepare(held)
-    first = sought(held, path, scene, share_of(end, 1))
+    first = sought(held, path, scene, end if _takes_too_long(problem, scene, end) else share_of(end, 1))
     if _RANKS[first.verdict] == 0:
         if (plain := as_own(problem, first, scene)) is None:
             return held, first
@@ -159,6 +161,18 @@ def _seconds(scene: Scene, first: Gap) -> float:
     windows, most = scene.evidence.windows, round(FEW * scarcity(scene.evidence))
     simulated = FITS * (1 + len(scene.begin.declared)) * min(len(windows), most) * windows.length
     return simulated * first.seconds / max(first.simulated_transitions, 1)
+
+
+def _takes_too_long(problem: Problem, scene: Scene, end: float) -> bool:
+    """Whether a search with the declared parameters would not end in the time that a first one leaves it."""
+    evidence, variant = scene.evidence, scene.begin.variant
+    for _ in range(2):  # kernels are compiled or loaded in the first
+        begun = time.perf_counter()
+        evidence.residuals([variant] * BATCH)
+    seconds = (time.perf_counter() - begun) / (BATCH * len(evidence.windows))
+    count = min(len(evidence.windows), round(FEW * scarcity(evidence)))
+    now = time.monotonic()
+    return FITS * (1 + len(problem.space.names)) * count * seconds > end - share_of(end, 1) or end <= now
 
 
 def _both(other: Gap, gap: Gap) -> Gap:

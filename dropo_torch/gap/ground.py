@@ -7,6 +7,7 @@ from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import mujoco
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
@@ -24,6 +25,8 @@ from dropo_torch.support.report import Report
 FEW, FEWER = 40, 10
 #: Residuals of a window from which on fewer windows do, which tell as much; the share of them that there are at least.
 RICH, SCARCE = 400, 0.5
+#: Evaluations of forces in a window from which on these cost much.
+COSTLY = 200
 
 
 @dataclass(frozen=True)
@@ -116,11 +119,23 @@ class State:
 def scarcity(evidence: Evidence) -> float:
     """Return which share of the usual windows tells enough, as each has many residuals.
 
-    Where nothing touches, all do: a base family has many numbers, and windows cost little.
+    Where nothing touches and windows cost little, all do: a base family has many numbers.
     """
-    if not evidence.twin.setting.signals.contacts.any():
+    if not evidence.twin.setting.signals.contacts.any() and evaluations(evidence) < COSTLY:
         return 1.0
     return float(np.clip(RICH / max(evidence.num_rows, 1), SCARCE, 1.0))
+
+
+def work(evidence: Evidence) -> int:
+    """Return how often forces are evaluated where the windows that refits use are simulated once."""
+    return min(len(evidence.windows), round(FEW * scarcity(evidence))) * evaluations(evidence)
+
+
+def evaluations(evidence: Evidence) -> int:
+    """Return how often forces are evaluated in a simulation of a window."""
+    setting = evidence.twin.setting
+    stages = 4 if setting.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 1
+    return int(evidence.windows.length * setting.frame_skip * stages)
 
 
 @dataclass(frozen=True)

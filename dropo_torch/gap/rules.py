@@ -181,6 +181,7 @@ class Cut:
         lengths: logged steps of a window that are tried, the longest first.
         blind: those before them where no velocity is measured: what a force does to positions grows with the square
             of the time; and
+        seconds: that they may last at most, and
         enough: windows of such a length that the log must have.
         rough: share of residuals whose variance, over noise on the initial states, stays unexplained, up to which a
             length will do.
@@ -193,6 +194,7 @@ class Cut:
 
     lengths: tuple[int, ...] = (30, 15, 8, 4)
     blind: tuple[int, ...] = (120, 60)
+    seconds: float = 1.0
     enough: int = 10
     rough: float = 0.03
     bent: float = 0.001

@@ -15,6 +15,7 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.ground import work
 from dropo_torch.gap.log import (
     cut_windows,
     episode_bounds,
@@ -44,6 +45,8 @@ MOST, FEW, SHORT = 120, 24, 160
 RICH, SCARCE = 120, 0.4
 #: Windows among which those that stand out are looked for, at most; of these that are searched, and with others beside.
 ALL, RARE, BESIDE = 600, 20, 60
+#: Evaluations of forces in a simulation of the windows that refits use from which on it is worth to compile kernels.
+LARGE = 8000
 #: Logged steps, and share of an episode, that are left out at its beginning for what candidates remember, at most.
 LEAD, LEAD_SHARE = 20, 0.1
 #: Windows of an episode from which on one of them is not missed.
@@ -139,6 +142,9 @@ def _scene(problem: Problem, train: Trajectories, held: Trajectories, rules: Rul
     shortest = cut_windows(train, setting.observation, rules.cut.lengths[-1], since=since)
     whole = Evidence(twin, shortest, noise, begin.variant, rough=True, rules=rules)
     evidence = _choose_windows(whole, train, begin, since)
+    if problem.config.backend == "mujoco" and work(evidence) >= LARGE:
+        twin = _twin(problem, setting, fast=True)
+        evidence = replace(evidence, twin=twin)
     return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
 
 
@@ -159,7 +165,8 @@ def with_parameters(scene: Scene, problem: Problem) -> Scene:
         scene: of the log.
         problem: with the other parameters.
     """
-    begin, twin = Hypothesis(tuple(start_values(problem).tolist())), _twin(problem, scene.setting)
+    begin = Hypothesis(tuple(start_values(problem).tolist()))
+    twin = _twin(problem, scene.setting, fast=scene.twin.warp)
     evidence = replace(scene.evidence, twin=twin, begin=begin.variant)
     return replace(scene, problem=problem, twin=twin, evidence=evidence, begin=begin)
 
@@ -175,10 +182,10 @@ def _noisy_starts(problem: Problem, setting: Setting) -> list[int]:
     return [c for c, place in positions if np.searchsorted(ends, place, "right") - 1 in joints]
 
 
-def _twin(problem: Problem, setting: Setting) -> Twin:
-    """What simulates a problem's windows, with the effects of its config."""
+def _twin(problem: Problem, setting: Setting, *, fast: bool = False) -> Twin:
+    """What simulates a problem's windows, with the effects of its config; with Warp where that is faster."""
     return Twin(
-        setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp",
+        setting, problem.space, num_threads=problem.config.threads, warp=fast or problem.config.backend == "warp",
         standing=None if problem.effects is None else problem.effects.at,
     )  # fmt: skip
 
@@ -311,8 +318,9 @@ def _lengths(whole: Evidence, train: Trajectories) -> tuple[int, ...]:
     known = setting.observation.index[[c for c in range(setting.observation.size) if c not in setting.masked]]
     if (known >= setting.model.nq).any():
         return cut.lengths
-    count = [sum((b - a + 1) // (length + 1) for a, b in episode_bounds(train)) for length in cut.blind]
-    return (*(n for n, windows in zip(cut.blind, count, strict=True) if windows >= cut.enough), *cut.lengths)
+    blind = [n for n in cut.blind if n * setting.signals.timestep <= cut.seconds]
+    count = [sum((b - a + 1) // (length + 1) for a, b in episode_bounds(train)) for length in blind]
+    return (*(n for n, windows in zip(blind, count, strict=True) if windows >= cut.enough), *cut.lengths)
 
 
 def _cut(

@@ -31,7 +31,7 @@ ALONG = (0.75, 0.5, 0.25, 0.125)
 #: Times that a start is looked for between one that does nothing and one that does harm.
 HALVINGS = 4
 #: Candidates that one batch of simulations holds.
-BATCH = 24
+BATCH = 96
 
 
 class Beside(Protocol):
@@ -144,6 +144,7 @@ def screen(
     """
     taken = {p.called for p in focus.fitted.hypothesis.placed}
     waiting, found = [c for c in candidates if c.called not in taken], list[Candidate]()
+    waiting.sort(key=lambda c: c.effect.has("force"))  # forces are asked step by step, of all of a batch at once
     for rows in parts(len(waiting), BATCH):
         found += _predict(focus, waiting[rows], tried.dead)
         on_progress(rows.stop / len(candidates))

@@ -43,6 +43,8 @@ from dropo_torch.support.checkpoint import Checkpoint
 NOTHING = Screening((), np.zeros(0), np.zeros((0, 0)), 0.0)
 #: Why what a log is too short for has no name.
 UNSURE = "what explains most of it may do so by chance, for this log has too few stretches that show it"
+#: Share of the gap that effects may leave to be an answer so far, where the time for the search is over.
+SO_FAR = 0.5
 #: Why what needs many numbers, and is still not right, has none.
 IMITATES = "what explains most of it has many numbers and is still not right: they may only imitate it"
 #: Why a base family that leaves too much has no names.
@@ -129,7 +131,7 @@ def search(
         checkpoint: where the state is kept between rounds, ``None`` for nowhere.
         resume: go on from there, if there is one.
         end: when no more effects are looked for, by ``time.monotonic``; what was found until then is judged.
-        latest: the same, if it is later, where what was found until then is most of the gap.
+        latest: the same, if it is later, where what was found until then is much of the gap.
 
     Raises:
         InputError: a checkpoint that is damaged, or of another search.
@@ -149,7 +151,7 @@ def search(
     found, unfinished = [state], ""
     try:
         while not state.done:
-            most = state.current.cost.left_of(state.base.cost) <= 1 - ground.rules.most
+            most = state.current.cost.left_of(state.base.cost) <= SO_FAR
             hurried = replace(ground, report=until(ground.report, max(end, latest) if most else end))
             state = keep(step(hurried.at(state), state, found.append))
             found.append(state)
@@ -157,7 +159,17 @@ def search(
         state = found[-1]
         unfinished = f"{error}, with {len(state.current.hypothesis.placed)} effects accepted"
     ended = conclude(ground.at(state), state)
-    return replace(ended, naming=replace(ended.naming, unfinished=unfinished))
+    naming = found_so_far(ended) if unfinished else ended.naming
+    return replace(ended, naming=replace(naming, unfinished=unfinished))
+
+
+def found_so_far(ended: Ended) -> Naming:
+    """Return what a search had accepted when its time was over, if that is much of the gap, as a part of the answer."""
+    ground, state, naming = ended.ground, ended.state, ended.naming
+    left = state.current.cost.left_of(state.base.cost)
+    if naming.named or not naming.gap or not state.current.hypothesis.placed or left > SO_FAR:
+        return naming
+    return naming if nonsense(ground, state.current) else replace(naming, final=state.current, named=True, refused="")
 
 
 def believed(ground: Ground, begin: Hypothesis, known: Ended) -> Ended | None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import permutations
 
-from dropo_torch.effects.base import Effect, Placed, Setting, find_effect
+from dropo_torch.effects.base import Effect, Placed, Setting, find_effect, object_number
 from dropo_torch.gap.accept import nonsense
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.limbs import joint_of, joint_of_column
@@ -20,6 +20,8 @@ from dropo_torch.gap.shares import families, shares_of
 ITERATIONS = (6, 12)
 #: Iterations in which one effect settles in the place of two, of which it had done the part of one.
 SETTLED = 40
+#: The effect that sits on the outermost of several bodies.
+LOAD = "payload"
 #: The round of attempts that only look for ties.
 ROUND = -1
 
@@ -239,12 +241,15 @@ def parted_by_step(ground: Ground, own: Refit, rival: Refit) -> bool:
 def canonical(
     ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]]
 ) -> tuple[State, tuple[tuple[Placed, ...], ...]]:
-    """Among ties name the one with the fewest numbers that the vocabulary lists first, if it may have a name."""
+    """Among ties name the one with the fewest numbers that the vocabulary lists first, if it may have a name.
+
+    What sits on one of several bodies as well is on the outermost, where tools and loads are.
+    """
     order = {effect.name: i for i, effect in enumerate(ground.effects)}
     listed = list(tied)
     for index, rivals in enumerate(listed):
         own = state.current.hypothesis.placed[index]
-        first = min((own, *rivals), key=lambda p: (len(p.values), order[p.effect.name]))
+        first = min((own, *rivals), key=lambda p: (len(p.values), order[p.effect.name], -_outward(ground.setting, p)))
         if first is own:
             continue
         instead = ground.refit(state.current.hypothesis.instead(index, first))
@@ -252,3 +257,13 @@ def canonical(
             state = replace(state, current=instead)
             listed[index] = tuple(own if p is first else p for p in rivals)
     return state, tuple(listed)
+
+
+def _outward(setting: Setting, placed: Placed) -> int:
+    """How many bodies are between the world and one on which something sits; 0 for other effects."""
+    if placed.effect.name != LOAD:
+        return 0
+    body, count = object_number(setting.model, "body", placed.target), 0
+    while body := int(setting.model.body_parentid[body]):
+        count += 1
+    return count

@@ -101,6 +101,7 @@ class Twin:
         coarser: the one of which this is the same with a finer step, whose transitions count these, too.
 
     Attributes:
+        warp: whether Warp simulates wherever it can.
         rates: for a column, the column that is its time derivative, or -1, ``(n,)``.
         simulated_transitions: logged transitions simulated so far.
     """
@@ -111,7 +112,7 @@ class Twin:
         coarser: Twin | None = None,
     ) -> None:  # fmt: skip
         self.setting, self.space, self._standing, self._chunk = setting, space, standing, chunk_size
-        self.num_threads, self._warp = num_threads, warp
+        self.num_threads, self.warp = num_threads, warp
         self._engine = VariantEngine(setting, space, num_threads=num_threads, warp=warp)
         self.rates = np.array(observed_rates(setting))
         self._commands: np.ndarray | None = None
@@ -126,7 +127,7 @@ class Twin:
             ratio = round(self.setting.model.opt.timestep / model.opt.timestep)
             setting = replace(self.setting, model=model, frame_skip=self.setting.frame_skip * ratio)
             self._finer[step] = Twin(
-                setting, self.space, num_threads=self.num_threads, chunk_size=self._chunk, warp=self._warp,
+                setting, self.space, num_threads=self.num_threads, chunk_size=self._chunk, warp=self.warp,
                 standing=self._standing, coarser=self,
             )  # fmt: skip
         return self._finer[step]

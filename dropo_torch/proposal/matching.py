@@ -56,7 +56,7 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
     if driven and not driven & found.keys():  # what is called after drives may be all that is measured of their joints
         other = _found(places, free, known, starts)
         found = other if driven & other.keys() else found
-    found, others = _along_own_axes(places, found, starts)
+    found, others = _along_own_axes(places, free, found, starts)
     matches = tuple(with_unit(found[p.label], found) for p in places if p.label in found)
     used = [m.column for m in matches] + list(taken)
     unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used) and not _counts(c, starts))
@@ -85,7 +85,7 @@ def _found(
 
 
 def _along_own_axes(
-    places: Sequence[Place], found: Mapping[str, Match], starts: np.ndarray
+    places: Sequence[Place], free: Sequence[Column], found: Mapping[str, Match], starts: np.ndarray
 ) -> tuple[dict[str, Match], tuple[Column, ...]]:
     """What was found without free bodies' velocities along other axes than the model's, and the columns of these.
 
@@ -98,16 +98,27 @@ def _along_own_axes(
         if quaternion is None:
             continue
         for angular in (False, True):
-            own = [found.get(p.label) for p in places if _is_rate_of(p, joint, angular=angular)]
-            path = [found.get(p.partner) for p in places if _is_rate_of(p, joint, angular=angular)]
-            if not all(own) or not (angular or all(path)):
+            rated = [p for p in places if _is_rate_of(p, joint, angular=angular)]
+            own = [m for p in rated if (m := found.get(p.label))]
+            path = [m.values for p in rated if (m := found.get(p.partner))]
+            if not angular and len(path) < len(rated):
                 continue
-            rates = np.stack([m.values for m in own if m], axis=1)
-            where = np.stack([m.values for m in path if m], axis=1) if not angular else quaternion
-            if told_otherwise(where, rates, quaternion, starts):
-                others += [m.column for m in own if m]
-                kept = {label: m for label, m in kept.items() if m not in own}
+            where = quaternion if angular else np.stack(path, axis=1)
+            for told in [[m.column for m in own]] if own else _triples(free, found, angular=angular):
+                rates = np.stack([c.values for c in told], axis=1)
+                if len(told) == len(rated) and told_otherwise(where, rates, quaternion, starts):
+                    others += told
+                    kept = {label: m for label, m in kept.items() if m not in own}
     return kept, tuple(others)
+
+
+def _triples(free: Sequence[Column], found: Mapping[str, Match], *, angular: bool) -> list[list[Column]]:
+    """Columns of velocities along x, y and z that are called alike, and are nothing of the model's."""
+    groups: dict[tuple, dict[str, Column]] = {}
+    for c in free:
+        if c.words.role == "velocity" and c.words.angular == angular and c.words.axis and not is_taken(c, found):
+            groups.setdefault((c.words.objects, c.words.numbers), {}).setdefault(c.words.axis, c)
+    return [[group[axis] for axis in _AXES] for group in groups.values() if {*group} == {*_AXES}]
 
 
 def _is_rate_of(place: Place, joint: int, *, angular: bool) -> bool:
@@ -125,9 +136,9 @@ def _without_parts(places: Sequence[Place], free: Sequence[Column], found: Mappi
             continue
         own = [m for m in found.values() if m.place.joint == p.joint and m.place.angular == p.angular]
         own = [m for m in own if m.place.kind == "velocity"]
-        families = {(m.column.array, m.column.words.objects, m.column.words.numbers) for m in own}
+        families = {(m.column.words.objects, m.column.words.numbers) for m in own}
         for c in free:
-            is_own = (c.array, c.words.objects, c.words.numbers) in families and c.words.axis == p.axis
+            is_own = (c.words.objects, c.words.numbers) in families and c.words.axis == p.axis
             if is_own and c.words.role == "velocity" and c.words.angular == p.angular and not is_taken(c, found):
                 kept = {label: m for label, m in kept.items() if m not in own}
     return kept

@@ -88,9 +88,10 @@ def _draw(figure: Any, gap: Gap, height: float) -> None:
 
 
 def _gained(course: Course) -> float:
-    """By how much effects improve the prediction of a position, in units of how much it moves."""
+    """By how much effects improve the prediction of a position, in units of how much it moves; without any, its error."""
     before, after = (
         float(np.sqrt(np.nanmean((line - course.measured) ** 2))) if np.isfinite(line).any() else 0.0
         for line in (course.before, course.after)
     )
-    return (before - after) / (float(np.ptp(course.measured)) or 1.0)
+    gained = before if np.array_equal(course.before, course.after, equal_nan=True) else before - after
+    return gained / (float(np.ptp(course.measured)) or 1.0)

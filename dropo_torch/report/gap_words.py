@@ -231,6 +231,8 @@ def ambiguous(effect: NamedEffect) -> str:
 def answer(gap: Gap) -> tuple[str, list[str]]:
     """Return what is missing in a sentence or two, and the items of a list that they announce, if any."""
     sentence, items = _with_values(gap)
+    if gap.unfinished and gap.verdict == "partly explained":
+        sentence = f"The time for the search was over before all was tried. So far: {sentence}"
     return (f"{pushes(gap.disturbances)} {sentence}" if gap.disturbances else sentence), items
 
 
@@ -409,7 +411,8 @@ def chi(gap: Gap) -> str:
     before, after = ("not known" if np.isnan(v) else short(v) for v in gap.reduced)
     what = "χ² per degree of freedom compares the misfit with the noise; about 1 means that only noise is left."
     if not any(map(is_named, gap.effects)):
-        return f"{what} It is {before} for your model with its declared parameters fitted."
+        fitted = "with its declared parameters fitted" if gap.declared else "as it is"
+        return f"{what} It is {before} for your model {fitted}."
     return f"{what} It was {before} before, and is {after} with the effects."
 
 

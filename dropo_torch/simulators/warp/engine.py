@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -377,9 +377,14 @@ def _at_once(launches: Sequence[Callable[..., Any]]) -> None:
     if len(launches) == 1:
         launches[0]()
         return
-    with ThreadPoolExecutor(len(launches)) as pool:
-        for job in [pool.submit(launch) for launch in launches]:
-            job.result()
+    for job in [_pool(os.getpid(), len(launches)).submit(launch) for launch in launches]:
+        job.result()
+
+
+@cache
+def _pool(_process: int, count: int) -> ThreadPoolExecutor:
+    """Threads of this process: one that was forked has none of its parent's."""
+    return ThreadPoolExecutor(count, thread_name_prefix="warp")
 
 
 def _period(batch: Batch, keep: bool) -> int:
