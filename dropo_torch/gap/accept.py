@@ -42,17 +42,21 @@ def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
 def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:
     """Return whether an effect may have a name: it removes enough, and chance among all candidates does not.
 
-    Where the windows that refits use leave this open, all windows decide, at half the level.
+    Where the windows that refits use leave this open, all windows decide, at half the level. The step with which a
+    simulator made a log is asked for by itself, not among all candidates.
     """
     if not matters(ground, state.base, whole, without):
         return False
-    chance, error = ground.rules.chance, ground.chance(whole, without) * ground.comparisons
+    rest = [p.key for p in without.hypothesis.placed]
+    steps = all(p.effect.steps for p in whole.hypothesis.placed if p.key not in rest)
+    comparisons = len({p.key for p in ground.candidates if p.effect.steps}) if steps else ground.comparisons
+    chance, error = ground.rules.chance, ground.chance(whole, without) * comparisons
     if error <= chance.error or error > chance.open or len(ground.evidence.windows) <= ground.most:
         return error <= chance.error
     ground.report("judging on all windows", 0.5)
     every, base = with_base(replace(ground, few=len(ground.evidence.windows), caps=1.0), state.base.hypothesis)
     whole, without = (every.refit(r.hypothesis, iterations=4) for r in (whole, without))
-    error = every.chance(whole, without) * ground.comparisons
+    error = every.chance(whole, without) * comparisons
     return matters(every, base, whole, without) and error <= 0.5 * chance.error
 
 

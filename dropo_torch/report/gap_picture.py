@@ -88,7 +88,7 @@ def _draw(figure: Any, gap: Gap, height: float) -> None:
 
 
 def _gained(course: Course) -> float:
-    """By how much effects improve the prediction of a position, in units of how much it moves; without any, its error."""
+    """By how much effects improve the prediction of a position, in units of its motion; without any, the error."""
     before, after = (
         float(np.sqrt(np.nanmean((line - course.measured) ** 2))) if np.isfinite(line).any() else 0.0
         for line in (course.before, course.after)
