@@ -417,15 +417,19 @@ def test_dry_friction_slides_and_sticks() -> None:
 PRESLIDING = {"effect": "joint_presliding", "target": "rail", "coulomb": 0.5, "displacement": 0.01}
 
 
-def bristled(push: np.ndarray, fine: int = 100) -> np.ndarray:
-    """Positions of the cart after each physics step, by small Euler steps of Dahl's equation in time."""
+def bristled(push: np.ndarray, fine: int = 100, larger: float = 1.0, falls: float = 1.0) -> np.ndarray:
+    """Positions of the cart after each physics step, by small Euler steps of the bristles' equation in time.
+
+    They hold ``larger`` times as much at rest as in motion, and less from a velocity ``falls`` on; as much for Dahl's.
+    """
     x = v = z = 0.0
     found = []
     for force in push:
         for _ in range(fine):
             v += STEP / fine * (force - 0.5 * z) / 2
             x += STEP / fine * v
-            z += STEP / fine * (v - abs(v) * z) / 0.01
+            level = 1 + (larger - 1) * np.exp(-((v / falls) ** 2))
+            z += STEP / fine * (v - abs(v) * z / level) / 0.01
         found.append(x)
     return np.array(found)
 
@@ -438,6 +442,17 @@ def test_presliding_gives_and_slides() -> None:
     light, spring = driven([PRESLIDING], np.full(200, 0.002))[:, 0], 0.002 / 50  # N by N/m, under 2 kg
     np.testing.assert_allclose(light, spring * (1 - np.cos(5 * STEP * np.arange(1, 201))), atol=0.1 * spring)
     assert forces(driven([PRESLIDING], np.full(400, 2.0)))[-1] == pytest.approx(2 - 0.5, rel=1e-3)
+
+
+def test_friction_that_gives_may_be_larger_when_slow() -> None:
+    """As LuGre's equation has it; without that, it is friction that gives and no more."""
+    push = np.repeat(np.random.default_rng(1).uniform(-1.5, 1.5, 12), 50)
+    lugre = {**PRESLIDING, "effect": "joint_lugre", "static": 0.9, "velocity": 0.15}
+    expected = bristled(push, larger=1.8, falls=0.15)
+    np.testing.assert_allclose(driven([lugre], push)[:, 0], expected, atol=0.03 * np.abs(expected).max())
+    assert np.abs(expected - bristled(push)).max() > 0.2 * np.abs(expected).max()
+    plain = driven([{**lugre, "static": 0.5}], push)
+    np.testing.assert_allclose(plain, driven([PRESLIDING], push), atol=1e-12)
 
 
 def test_presliding_begins_as_the_joint_moves() -> None:

@@ -2094,6 +2094,22 @@ def test_answer_so_far_is_given_when_the_time_is_over(
     assert lasting(on) == lasting(found(TWO))
 
 
+@pytest.mark.parametrize(("left", "absurd", "named"), [(40.0, False, True), (60.0, False, False), (40.0, True, False)])
+def test_what_was_accepted_is_the_answer_so_far_if_it_is_much_of_the_gap(
+    left: float, absurd: bool, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fitted(reduced: float, *placed: Placed) -> SimpleNamespace:
+        cost = Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3)
+        return SimpleNamespace(cost=cost, hypothesis=Hypothesis((), placed))
+
+    damping = Placed(VOCABULARY["joint_damping"], "hinge", (0.1,))
+    state = SimpleNamespace(base=fitted(101.0), current=fitted(left, damping))
+    nothing = Naming(None, None, None, state.base, True, refused="it leaves too much")
+    monkeypatch.setattr(searching, "nonsense", lambda *_: ["it is at a bound"] * absurd)
+    naming = searching.found_so_far(Ended(None, state, nothing))
+    assert naming == (dataclasses.replace(nothing, final=state.current, named=True, refused="") if named else nothing)
+
+
 @pytest.mark.parametrize(
     ("contacts", "shrinks", "move", "times"),
     [(True, 0.5, 1.0, 9), (True, 0.01, 1.0, 2), (True, 0.5, 1e-3, 2), (False, 0.5, 1.0, 2)],

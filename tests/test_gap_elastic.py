@@ -54,6 +54,18 @@ def test_dry_friction_that_gives_is_told_from_other_friction(joint: str, coulomb
     assert gap.reduced[1] < 1.1
 
 
+def test_dry_friction_that_gives_and_is_larger_when_slow_is_found() -> None:
+    numbers = {"coulomb": 0.2, "displacement": 0.01, "static": 0.36, "velocity": 0.3}
+    gap = search(
+        simulate_truth(CART_POLE, [Effect("joint_lugre", "hinge", numbers)], 3, episodes=4, transitions=100),
+        ("joint_lugre", "joint_presliding", "joint_friction", "joint_stribeck", "joint_damping"),
+    )
+    assert [(e.effect, e.target) for e in gap.effects] == [("joint_lugre", "hinge")]
+    found = gap.effects[0].parameters
+    assert {k: found[k].value for k in numbers} == pytest.approx(numbers, rel=0.1)
+    assert gap.reduced[1] < 1.1
+
+
 def test_bristles_follow_the_motion_before_a_simulation() -> None:
     """Once a joint has turned, its friction is not what its velocity alone tells."""
     placed = Placed(find_effect("joint_presliding"), "hinge", (0.2, 0.1))
