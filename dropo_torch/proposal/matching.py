@@ -101,7 +101,7 @@ def _along_own_axes(
             rated = [p for p in places if _is_rate_of(p, joint, angular=angular)]
             own = [m for p in rated if (m := found.get(p.label))]
             path = [m.values for p in rated if (m := found.get(p.partner))]
-            if not angular and len(path) < len(rated):
+            if not rated or (not angular and len(path) < len(rated)):  # a ball joint has no place
                 continue
             where = quaternion if angular else np.stack(path, axis=1)
             for told in [[m.column for m in own]] if own else _triples(free, found, angular=angular):
