@@ -58,7 +58,7 @@ class JointPresliding(JointEffect):
         )
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        force, displacement = self.quantities(setting, target)
+        force, displacement = self.quantities(setting, target)[:2]
         return [np.array([share * force.scale, far * displacement.neutral]) for share, far in STARTS]
 
     def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
