@@ -756,7 +756,8 @@ def test_only_a_first_number_is_absent_at_a_bound() -> None:
         ("joint_elasticity", "damping"),
         ("joint_elasticity", "inertia"),
     }  # a spring without, or beside the model's
-    assert {*shapes} <= drag | rotor | {("joint_stribeck", "static"), ("contact_rolling", "torsional")}
+    rest = {("joint_stribeck", "static"), ("joint_lugre", "static"), ("contact_rolling", "torsional")}
+    assert {*shapes} <= drag | rotor | rest
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "warp"])
