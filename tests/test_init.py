@@ -702,6 +702,7 @@ def test_episodes_begin_where_a_column_changes_or_time_begins_anew(tmp_path: Pat
         clock = find_clock(read_columns(tmp_path / "log.csv"), 0.005)
         assert (clock.episode.entry if clock.episode else None, clock.breaks) == (episode, breaks)
         assert np.flatnonzero(clock.starts(90, (0,))).tolist() == [0, 30, 60]
+        assert ("trial parts the rows into 3 episodes" in clock.why) == (episode is not None)
 
 
 def test_a_velocity_is_told_from_others_by_motion() -> None:

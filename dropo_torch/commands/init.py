@@ -94,6 +94,8 @@ def columns_table(matching: Matching) -> Table:
     from dropo_torch.proposal.text import described
 
     table = Table("column", "of the model", "unit", "sure?", "found by")
+    for column in table.columns[:2]:
+        column.overflow = "fold"
     for match in matching.matches:
         table.add_row(*described(match))
     return table

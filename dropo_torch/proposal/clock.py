@@ -125,6 +125,8 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
     within = usual[usual <= gap * median] / median
     even = bool((np.abs(within - 1) <= EVEN).all())
     why = [f"time stamps of {column.entry} {told}"]
+    if episode is not None:
+        why.append(f"{episode.entry} parts the rows into {1 + int(known[1:].sum())} episodes")
     if breaks:
         why.append(f"they begin anew, or leave a gap, at {len(breaks)} rows: an episode begins there")
     near = within < MISSING
