@@ -67,8 +67,8 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     same = one_kind(found.current.hypothesis)
     kind = same or len(joints_of(ground)) == 1
     most = rules.hopeless * rules.clearer[int(kind)]
-    if leaves_too_much(ground, state.base.hypothesis, found.current.hypothesis, most):
-        return found
+    if not same and leaves_too_much(ground, state.base.hypothesis, found.current.hypothesis, most):
+        return found  # before all that costs more
     best = found if found.done or same else extend(ground, found)  # what contains the first effects may be the truth
     cost = best.current.cost
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
