@@ -110,4 +110,4 @@ def test_a_large_search_simulates_with_warp_and_sees_the_same(
     fast = scene_of(tmp_path)
     assert fast.twin.warp
     one, other = (s.evidence.residuals([s.begin.variant])[0] for s in (arms, fast))
-    np.testing.assert_allclose(one, other, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-8)

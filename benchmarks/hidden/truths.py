@@ -279,7 +279,7 @@ def _load_friction(plant: Plant, joint: str, coefficient: float) -> Force:
     return _dry_friction(plant, joint, lambda _q, _v: coefficient * abs(float(plant.data.qfrc_actuator[i])))
 
 
-#: Steps of a rotor in a fine step.
+#: Steps of a rotor, and of bristles, in a fine step.
 _ROTOR_STEPS, _BRISTLE_STEPS = 8, 8
 
 

@@ -158,21 +158,25 @@ def _as_good(problem: Problem, free: Sequence[str], gap: Gap, scene: Scene) -> P
 
 def _seconds(scene: Scene, first: Gap) -> float:
     """Seconds that a search with the declared parameters takes at the least, by what simulations took so far."""
-    windows, most = scene.evidence.windows, round(FEW * scarcity(scene.evidence))
-    simulated = FITS * (1 + len(scene.begin.declared)) * min(len(windows), most) * windows.length
-    return simulated * first.seconds / max(first.simulated_transitions, 1)
+    return _transitions(scene, len(scene.begin.declared)) * first.seconds / max(first.simulated_transitions, 1)
 
 
 def _takes_too_long(problem: Problem, scene: Scene, end: float) -> bool:
     """Whether a search with the declared parameters would not end in the time that a first one leaves it."""
+    if math.isinf(end):
+        return False
     evidence, variant = scene.evidence, scene.begin.variant
     for _ in range(2):  # kernels are compiled or loaded in the first
         begun = time.perf_counter()
         evidence.residuals([variant] * BATCH)
-    seconds = (time.perf_counter() - begun) / (BATCH * len(evidence.windows))
-    count = min(len(evidence.windows), round(FEW * scarcity(evidence)))
-    now = time.monotonic()
-    return FITS * (1 + len(problem.space.names)) * count * seconds > end - share_of(end, 1) or end <= now
+    took, simulated = time.perf_counter() - begun, BATCH * len(evidence.windows) * evidence.windows.length
+    return _transitions(scene, len(problem.space.names)) * took / simulated > end - share_of(end, 1)
+
+
+def _transitions(scene: Scene, numbers: int) -> int:
+    """Transitions that a search with so many declared parameters simulates at the least."""
+    count = min(len(scene.evidence.windows), round(FEW * scarcity(scene.evidence)))
+    return FITS * (1 + numbers) * count * scene.evidence.windows.length
 
 
 def _both(other: Gap, gap: Gap) -> Gap:

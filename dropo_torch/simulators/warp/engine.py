@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from itertools import pairwise
@@ -377,7 +377,9 @@ def _at_once(launches: Sequence[Callable[..., Any]]) -> None:
     if len(launches) == 1:
         launches[0]()
         return
-    for job in [_pool(os.getpid(), len(launches)).submit(launch) for launch in launches]:
+    jobs = [_pool(os.getpid(), len(launches)).submit(launch) for launch in launches]
+    wait(jobs)  # all of them, also where one fails: they share memory with the next
+    for job in jobs:
         job.result()
 
 
