@@ -48,6 +48,7 @@ from dropo_torch.gap import (
 )
 from dropo_torch.gap import refit as refitting
 from dropo_torch.gap import search as searching
+from dropo_torch.gap import ties as tying
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed, paired
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearization, cost_of, robust_factors
@@ -320,6 +321,29 @@ def test_a_finer_step_is_no_number_that_imitates() -> None:
     free = Hypothesis((), (cogging, placed("joint_stiffness", 1.0, 0.0)))
     with_step = dataclasses.replace(free, placed=(*free.placed, Placed(find_effect("integration"), None, (0.001,))))
     assert beyond_free(with_step, Rules()) == beyond_free(free, Rules()) > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "left", "told"), [("integration", 1.05, True), ("integration", 1.2, False), ("joint_damping", 1.05, False)]
+)
+def test_the_models_own_step_may_leave_more_of_a_small_gap(name: str, left: float, told: bool) -> None:
+    """What it leaves is no more than noise then, and it claims nothing of the robot."""
+
+    def fitted(reduced: float, *placed: Placed) -> Any:
+        cost = Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3)
+        return SimpleNamespace(cost=cost, hypothesis=Hypothesis((), placed))
+
+    placed = Placed(VOCABULARY[name], None, (0.001,))
+    assert accounts(fitted(left, placed), fitted(1.4), Rules()) == told
+
+
+def test_a_load_is_told_of_the_outermost_of_bodies_that_tie() -> None:
+    setting = scene_of().setting
+    load, damping = VOCABULARY["payload"], VOCABULARY["joint_damping"]
+    names = {n: Placed(load, n, (0.1, 0.0, 0.0, 0.0)) for n in load.targets(setting)}
+    found = {n: tying._outward(setting, placed) for n, placed in names.items()}
+    assert found["pole"] == found["cart"] + 1
+    assert tying._outward(setting, Placed(damping, "hinge", (0.1,))) == 0
 
 
 def test_many_numbers_may_leave_less_of_the_gap() -> None:

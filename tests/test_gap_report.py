@@ -26,7 +26,7 @@ from dropo_torch.gap.result import (
     Score,
     Strength,
 )
-from dropo_torch.report import gap_words, write_gap_picture, write_gap_report
+from dropo_torch.report import gap_picture, gap_words, write_gap_picture, write_gap_report
 from dropo_torch.report.figures.drawing import BLUE, ORANGE
 from dropo_torch.report.figures.gap import running_median
 
@@ -149,6 +149,14 @@ def unnamed() -> Gap:
         base, effects=(effect,), after=base.before, reduced=(412.31, 412.31), ranking=ranking,
         residuals=(force("odd"),), symbolic="force(elbow) = 0.101 · sin(3.00 · velocity(elbow))³",
     )  # fmt: skip
+
+
+def test_without_names_a_picture_shows_where_predictions_are_worst() -> None:
+    right, wrong = (
+        replace(c, before=c.measured + off, after=c.measured + off)
+        for c, off in ((course("shoulder"), 0.01), (course("elbow"), 0.2))
+    )
+    assert gap_picture._gained(wrong) > gap_picture._gained(right) > 0
 
 
 def course(label: str, seed: int = 0) -> Course:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dropo_torch.effects import Effect
-from dropo_torch.gap.ground import FEW, scarcity
+from dropo_torch.gap.ground import count_refitted
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import Gap
@@ -175,8 +175,7 @@ def _takes_too_long(problem: Problem, scene: Scene, end: float) -> bool:
 
 def _transitions(scene: Scene, numbers: int) -> int:
     """Transitions that a search with so many declared parameters simulates at the least."""
-    count = min(len(scene.evidence.windows), round(FEW * scarcity(scene.evidence)))
-    return FITS * (1 + numbers) * count * scene.evidence.windows.length
+    return FITS * (1 + numbers) * count_refitted(scene.evidence) * scene.evidence.windows.length
 
 
 def _both(other: Gap, gap: Gap) -> Gap:

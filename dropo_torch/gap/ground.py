@@ -128,7 +128,12 @@ def scarcity(evidence: Evidence) -> float:
 
 def work(evidence: Evidence) -> int:
     """Return how often forces are evaluated where the windows that refits use are simulated once."""
-    return min(len(evidence.windows), round(FEW * scarcity(evidence))) * evaluations(evidence)
+    return count_refitted(evidence) * evaluations(evidence)
+
+
+def count_refitted(evidence: Evidence) -> int:
+    """Return how many windows refits use."""
+    return min(len(evidence.windows), round(FEW * scarcity(evidence)))
 
 
 def evaluations(evidence: Evidence) -> int:
